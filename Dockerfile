@@ -1,5 +1,6 @@
 # The package on a CPU; without a command it runs the demo into /data/demo:
-#   docker build -t gnss-sem-map . && docker run --rm -v "$PWD:/data" gnss-sem-map
+#   docker build -t gnss-sem-map . && docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" gnss-sem-map
+# Without --user, results belong to root.
 # --build-arg EXTRAS='[segmentation]' adds torch; --build-arg PIP_EXTRA_INDEX_URL=... names the index of its CPU builds, which pip then prefers.
 FROM python:3.11-slim
 # --build-arg VERSION=1.2.3 names the version, which is otherwise the fallback: .git is not copied.

@@ -30,6 +30,8 @@ from factor_graphs.measurements import (
 from factor_graphs.receiver_rows import GNSS_COLUMNS as GNSS_COLUMNS
 from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
 from factor_graphs.surveyed_points import SurveyedPoints, to_points
+from factor_graphs.table_dates import is_date, seconds_of_dates, unix_scale
+from factor_graphs.tables import Column, Layout, layout_of
 from factor_graphs.valid_fixes import valid_fixes
 
 if TYPE_CHECKING:
@@ -44,11 +46,11 @@ WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 5.0
 MAY_LACK = ("stamp_s", "std_e_m", "std_n_m", "std_u_m")
 POINT_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "easting_m", "northing_m", "height_m", "epsg", *MAY_LACK)
-LONGEST_HEADER = 10_000
 NOT_DEFINITE = "their covariance is not positive definite; used without correlations"
 NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$"
 # A table with a larger share of damaged rows is another kind of table; its first row is in line 2.
 MOST_DAMAGED, FIRST_ROW = 0.5, 2
+STAMP = "stamp_s"
 
 
 def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
@@ -131,8 +133,8 @@ def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:
 
 def parse_points(content: bytes, frame: LocalFrame, where: str) -> SurveyedPoints:
     """Surveyed points of the content of a CSV file; see `read_points`."""
-    header = names_in(content)
-    numbers = [name for name in POINT_COLUMNS if name in header]
+    layout = layout_of(content, ("name", "type"), POINT_COLUMNS)
+    numbers = [name for name in POINT_COLUMNS if layout.column(name) is not None]
     types = {"name": "string", "type": "string"} | dict.fromkeys(numbers, "float64")
     table = parse_columns(content, types, where)
     names, kinds = ([str(text).strip() for text in table[column].to_pylist()] for column in ("name", "type"))
@@ -180,82 +182,119 @@ def fix_rows(rows: Array, where: str) -> tuple[Array, dict[str, int]]:
 
 
 def parse_numbers(
-    content: bytes, columns: tuple[str, ...], where: str, longest_step_s: float, more: tuple[str, ...] = ()
+    content: bytes,
+    columns: tuple[str, ...],
+    where: str,
+    longest_step_s: float,
+    more: tuple[str, ...] = (),
+    epoch_ns: int = 0,
 ) -> Array:
     """The named columns of a CSV file, whatever their order, (n, c), then those of `more`; the first is a stamp, s.
 
     A cell without a value is NaN, and so is a column of `more` that is not there. Raises MeasurementError as
     `parse_columns` does, and for stamps in another unit.
     """
-    header = names_in(content)
-    there = [*columns, *(name for name in more if name in header)]
-    table = parse_columns(content, dict.fromkeys(there, "float64"), where)
+    table = parse_columns(content, dict.fromkeys(columns, "float64"), where, epoch_ns, more)
     rows = np.full((table.num_rows, len(columns) + len(more)), np.nan)
     for k, name in enumerate([*columns, *more]):
-        if name in there:
+        if name in table.column_names:
             rows[:, k] = table[name].to_numpy()
     if fault := unit_fault(rows[:, 0], longest_step_s):
-        raise MeasurementError(f"{where}: {fault}")
+        raise MeasurementError(
+            f"{where}: {fault}; the name of the column may say so: stamp_ms, stamp_us, stamp_ns"
+        )
     return rows
 
 
-def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table:
+def parse_columns(
+    content: bytes, types: Mapping[str, str], where: str, epoch_ns: int = 0, more: tuple[str, ...] = ()
+) -> Table:
     """The named columns of a CSV file, each with its Arrow type; a damaged row has none of the damaged values.
 
-    Raises MeasurementError for another table, and where most rows are damaged.
+    Columns of `more` are numbers that may be missing. Stamps that are dates count from `epoch_ns`, Unix ns. How the
+    table may be written: `tables`. Raises MeasurementError for another table, and where most rows are damaged.
     """
     import pyarrow as pa
 
     expected = f"expected numbers in columns {','.join(types)}; a stamp is a number of seconds"
-    names = names_in(content)
-    if names == [""]:
-        raise MeasurementError(f"{where}: empty; {expected}")
-    if wrong := [name for name in types if names.count(name) != 1]:
-        found = " ".join(",".join(names).split())[:200]
-        raise MeasurementError(f"{where}: column {wrong[0]} is missing or repeated in {found}; {expected}")
     try:
-        table = _read(content, names, types)
+        layout = layout_of(content, types, more)
+        found = {name: layout.column(name) for name in (*types, *more)}
+    except MeasurementError as error:
+        raise MeasurementError(f"{where}: {error}; {expected}") from None
+    if layout.header in ([], [""]):
+        raise MeasurementError(f"{where}: empty; {expected}")
+    if wrong := [name for name in types if found[name] is None]:
+        raise MeasurementError(
+            f"{where}: column {wrong[0]} is missing or repeated in {layout.shown}; {expected}"
+        )
+    columns = {name: column for name, column in found.items() if column is not None}
+    kinds = {name: types.get(name, "float64") for name in columns}
+    has_dates = kinds.get(STAMP) == "float64" and is_date(layout, columns[STAMP])
+    if has_dates:
+        kinds[STAMP] = "string"
+    try:
+        table = _read(layout, columns, kinds)
     except (pa.ArrowException, ValueError, KeyError) as error:
-        repaired = _without_damage(content, names, types)
+        repaired = _without_damage(layout, columns, kinds)
         if repaired is None:
             raise MeasurementError(f"{where}: {' '.join(str(error).split())[:200]}; {expected}") from None
         table = repaired
     if table.num_rows == 0:
         raise MeasurementError(f"{where}: no rows; {expected}")
+    return _in_our_units(table, columns, kinds, epoch_ns if has_dates else None)
+
+
+def _in_our_units(
+    table: Table, columns: Mapping[str, Column], kinds: Mapping[str, str], epoch_ns: int | None
+) -> Table:
+    """The same table in SI units and degrees; with an epoch, its stamps are dates."""
+    import pyarrow as pa
+
+    for name, column in columns.items():
+        if name == STAMP and epoch_ns is not None:
+            values = seconds_of_dates(table[name].to_pylist(), epoch_ns)
+        elif kinds[name] == "string":
+            continue
+        else:
+            values = table[name].to_numpy().astype(np.float64)
+            scale = column.scale if column.unit or name != STAMP else unix_scale(values)
+            if scale == 1.0:
+                continue
+            values = values * scale
+        table = table.set_column(table.column_names.index(name), name, pa.array(values))
     return table
 
 
-def names_in(content: bytes) -> list[str]:
-    """The names of the columns of a CSV file, in its order."""
-    header = content[:LONGEST_HEADER].partition(b"\n")[0].decode("utf-8-sig", "replace")
-    return [name.strip().strip('"') for name in header.split(",")]
-
-
 def _read(
-    content: bytes,
-    names: list[str],
+    layout: Layout,
+    columns: Mapping[str, Column],
     types: Mapping[str, str],
     if_invalid: Callable[[InvalidRow], str] | None = None,
     encoding: str = "utf8",
 ) -> Table:
-    """The columns in `types` of rows with columns `names`; raises what pyarrow does."""
+    """The columns in `types` of a table; raises what pyarrow does."""
     import pyarrow as pa
     from pyarrow import csv
 
+    names = [f"column {k}" for k in range(len(layout.header))]
+    for name, column in columns.items():
+        names[column.at] = name
     return csv.read_csv(
-        pa.BufferReader(content),
+        pa.BufferReader(pa.py_buffer(layout.rows)),
         # with several threads an error does not tell its row
         read_options=csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False, encoding=encoding),
-        parse_options=csv.ParseOptions(invalid_row_handler=if_invalid),
+        parse_options=csv.ParseOptions(delimiter=layout.separator, invalid_row_handler=if_invalid),
         convert_options=csv.ConvertOptions(
             include_columns=list(types),
             column_types={name: pa.type_for_alias(kind) for name, kind in types.items()},
             strings_can_be_null=True,
+            decimal_point=layout.decimal,
         ),
     )
 
 
-def _without_damage(content: bytes, names: list[str], types: Mapping[str, str]) -> Table | None:
+def _without_damage(layout: Layout, columns: Mapping[str, Column], types: Mapping[str, str]) -> Table | None:
     """The table without what is damaged in it; None where most rows are damaged: it is another kind of table.
 
     A row with too many or too few cells becomes a row without values, and a cell that is no number is without a value:
@@ -271,23 +310,25 @@ def _without_damage(content: bytes, names: list[str], types: Mapping[str, str]) 
         return "skip"
 
     try:  # as latin1 every byte is a character
-        texts = _read(content, names, dict.fromkeys(types, "string"), leave_out, "latin1")
+        texts = _read(layout, columns, dict.fromkeys(types, "string"), leave_out, "latin1")
     except (pa.ArrowException, ValueError, KeyError):
         return None
-    damaged, columns = np.zeros(texts.num_rows, np.bool_), {}
+    damaged, values = np.zeros(texts.num_rows, np.bool_), {}
     for name, kind in types.items():
-        columns[name] = texts[name]
+        values[name] = texts[name]
         if kind != "string":
             cells = compute.utf8_trim_whitespace(texts[name])
+            if layout.decimal == ",":
+                cells = compute.replace_substring(cells, ",", ".")
             is_number = compute.match_substring_regex(cells, NUMBER)
             damaged |= compute.invert(is_number).fill_null(False).to_numpy()
-            columns[name] = compute.if_else(is_number, cells, None).cast(kind)
+            values[name] = compute.if_else(is_number, cells, None).cast(kind)
     first, lines = np.array(invalid, dtype=np.int64).reshape(-1, 2).T
     if damaged.sum() + lines.sum() > MOST_DAMAGED * (texts.num_rows + lines.sum()):
         return None
     places = np.repeat(first - FIRST_ROW - np.arange(len(first)), lines)
     rows = np.insert(np.arange(texts.num_rows), places, -1)
-    return pa.table(columns).take(pa.array(rows, mask=rows < 0))
+    return pa.table(values).take(pa.array(rows, mask=rows < 0))
 
 
 def _receiver_rows(path: Path) -> tuple[Array, dict[str, int]]:

@@ -199,7 +199,7 @@ def _doubt(wheels: Wheels, off: Array, ahead: Array) -> str:
     if share > MOST_MISFIT:
         return f"they differ from the speed by {100 * share:.0f} %: another clock or vehicle?"
     if SCALES[0] <= -scale <= SCALES[1]:
-        return f"their scale is {scale:.3f}: they count backwards; change their sign"
+        return f"their scale is {scale:.3f}: they count backwards (change their sign), or the drive is all in reverse"
     if not SCALES[0] <= scale <= SCALES[1]:
         unit = next((name for name, value in UNITS.items() if abs(abs(scale) / value - 1) < 0.1), "")
         is_in = f": they are in {unit}, give m/s" if unit else ", expected about 1: give m/s"

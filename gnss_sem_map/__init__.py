@@ -5,10 +5,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from gnss_sem_map.files.kernel_cache import find_kernel_cache
+
 if TYPE_CHECKING:
     from gnss_sem_map.runs.finished_run import Run, Settings, open_drive, run
 
 __all__ = ["Run", "Settings", "open_drive", "run"]
+
+find_kernel_cache()  # before numba is imported
 
 
 def __getattr__(name: str) -> Any:

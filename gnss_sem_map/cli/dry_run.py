@@ -36,7 +36,7 @@ def print_plan(
 
     seconds = memory_mb = 0.0
     if align_to is not None and origin is not None:
-        read_base(align_to, origin)
+        read_base(align_to, origin, settings.delivery.geoid)
     for source in sources:
         log = source.open_log()
         if source.segmenter is None and log.cameras:

@@ -7,6 +7,7 @@ the IMU can be read without a receiver, `read_imu(path)` does.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +20,9 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.sensor_log.conventions import SensorConventions
+
+MOST_SEARCHED, MOST_OFFERED = 300, 8
+"""Drives are looked for among so many files and folders of each folder; and so many are named."""
 
 
 @cache
@@ -44,9 +48,29 @@ def detect_format(drive: Path) -> str:
         return fitting[0]
     if fitting:
         raise DataError(f"{shown(drive)}: looks like {' and '.join(fitting)}; choose one with --format")
+    if offered := drives_in(drive):
+        more = f" and {len(offered) - MOST_OFFERED} more" if len(offered) > MOST_OFFERED else ""
+        raise DataError(
+            f"{shown(drive)}: no drive, but a folder of drives; give one of them, or several:"
+            f" {', '.join(shown(path) for path in offered[:MOST_OFFERED])}{more}"
+        )
     found = [shown(path.name) for path in inside(drive)][:8]
     signs = ", or ".join(f"{reader.SIGNS}" for reader in readers().values())
     raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}")
+
+
+def drives_in(folder: Path, depth: int = 3) -> list[Path]:
+    """The drives in a folder, as far down as a data set has them; folders that cannot be read have none."""
+    found: list[Path] = []
+    with suppress(DataError):
+        for path in inside(folder)[:MOST_SEARCHED]:
+            if path.is_symlink() or not path.is_dir():
+                continue
+            if any(reader.is_drive(path) for reader in readers().values()):
+                found.append(path)
+            elif depth > 1:
+                found += drives_in(path, depth - 1)
+    return found
 
 
 def open_drive(

@@ -10,7 +10,8 @@
                                                        or by `speed_unit` in log.yaml
     control_points.csv  optional: surveyed points, see `factor_graphs.csv_log.read_points`
     log.yaml            optional: see `log_yaml.LogFile`
-    lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp];
+    lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp],
+                                                       or text in <number>.txt;
                                                        intensity from 0 to 1, or to `intensity_max` in log.yaml
     images/stamps.csv   number,stamp_s             images/<number>.png    or .jpg
 
@@ -46,6 +47,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuSamples, WheelSpeeds, clean_imu, clean_wheels
 from factor_graphs.receiver_rows import MORE_COLUMNS
 from factor_graphs.surveyed_points import SurveyedPoints
+from factor_graphs.tables import layout_of
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
@@ -64,6 +66,7 @@ MOST_DIGITS = 19
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
 STAMPS = "stamps.csv"
+UNIT_KEYS = {"ax": "force_unit", "wx": "rate_unit", "speed_mps": "speed_unit"}
 FORMAT, SIGNS = "table", "imu.csv and gnss.csv, or lidar/stamps.csv (CSV log)"
 
 
@@ -77,12 +80,12 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     about = read_log_yaml(drive / "log.yaml")
     imu, imu_skips = _imu(drive / "imu.csv", about)
     receiver, fix_skips = _receiver(drive, about, None if imu is None else imu.stamps)
-    wheels, wheel_skips = _wheels(drive / "wheels.csv")
+    wheels, wheel_skips = _wheels(drive / "wheels.csv", about)
     frame = receiver.frame
     points = None if frame is None else _points(drive / "control_points.csv", frame)
     lidars, scan_skips = _lidars(drive, about)
     calibration = calibration_of(about, drive / "log.yaml")
-    images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
+    images, image_skips = _images(drive / "images", about, calibration.cameras)
     return SensorLog(
         name=shown(drive.name),
         epoch_ns=about.epoch_ns,
@@ -118,7 +121,7 @@ def read_imu(drive: Path) -> tuple[ImuSamples, SensorConventions]:
 def _imu(path: Path, about: LogFile) -> tuple[ImuSamples | None, list[Skip]]:
     if not is_file(path):
         return None, [_missing(path, IMU_COLUMNS)]
-    rows = _numbers(path, IMU_COLUMNS, LONGEST_IMU_STEP_S)
+    rows = _numbers(path, IMU_COLUMNS, LONGEST_IMU_STEP_S, about)
     with _as_data_error():
         imu, repairs = clean_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
     check_date(float(imu.stamps[-1]), about.epoch_ns, shown(path))
@@ -143,8 +146,12 @@ def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Ar
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
     path, skips = drive / "gnss.csv", []
     if about.gnss_file is None:
-        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, MORE_COLUMNS)
-    elif is_file(path):
+        try:
+            given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
+        except DataError as error:
+            other = f"a table without deviations, or above a geoid: `gnss_file: {{path: {path.name}}}` in log.yaml"
+            raise DataError(f"{error}; {other}") from None
+    elif is_file(path) and about.gnss_file.path != path.name:
         raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
     else:
         path = drive / about.gnss_file.path
@@ -159,11 +166,11 @@ def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Ar
     return rows, skips + [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
 
 
-def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
+def _wheels(path: Path, about: LogFile) -> tuple[WheelSpeeds | None, list[Skip]]:
     """Wheel speeds and the skipped rows; None where there is no such table."""
     if not is_file(path):
         return None, []
-    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
+    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S, about)
     wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
     return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
 
@@ -177,11 +184,18 @@ def _points(path: Path, frame: LocalFrame) -> SurveyedPoints | None:
 
 
 def _numbers(
-    path: Path, columns: tuple[str, ...], longest_step_s: float, more: tuple[str, ...] = ()
+    path: Path, columns: tuple[str, ...], longest_step_s: float, about: LogFile, more: tuple[str, ...] = ()
 ) -> Array:
     """The named columns of a CSV file, whatever their order: (n, c), as `parse_numbers` has them."""
     with _as_data_error():
-        return parse_numbers(_content(path, columns), columns, shown(path), longest_step_s, more)
+        content = _content(path, columns)
+        for name, key in UNIT_KEYS.items():
+            column = layout_of(content, columns).column(name) if name in columns else None
+            if column is not None and column.scale != 1.0 and getattr(about, key) is not None:
+                raise DataError(
+                    f"{shown(path)}: the unit of {name} is in its header, and {key} in log.yaml; remove {key}"
+                )
+        return parse_numbers(content, columns, shown(path), longest_step_s, more, about.epoch_ns)
 
 
 def _content(path: Path, columns: tuple[str, ...]) -> bytes:
@@ -198,14 +212,14 @@ def _as_data_error() -> Iterator[None]:
         raise DataError(str(error)) from None
 
 
-def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
+def _stamps(path: Path, what: str, epoch_ns: int) -> tuple[dict[int, float], list[Skip]]:
     """Stamp of every frame, the first one if there are several; and the skipped lines.
 
     A number may have 19 digits: it is never a floating number.
     """
     columns = {"number": "string", "stamp_s": "float64"}
     with _as_data_error():
-        table = parse_columns(_content(path, tuple(columns)), columns, shown(path))
+        table = parse_columns(_content(path, tuple(columns)), columns, shown(path), epoch_ns)
     texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
     check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
     stamps: dict[int, float] = {}
@@ -232,7 +246,9 @@ def _whole(text: str) -> int | None:
     return int(whole) if whole.isdecimal() and len(whole) <= MOST_DIGITS else None
 
 
-def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
+def _stamped(
+    what: str, folder: Path, epoch_ns: int, *suffixes: str
+) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
     """Number, stamp and file of every frame that has a stamp and a file; and the skipped frames."""
     found = frames.numbered(what, folder, *suffixes)
     if not found.files and is_folder(folder) and (n := sum(path.name != STAMPS for path in inside(folder))):
@@ -240,7 +256,7 @@ def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, f
         found.skips.append(Skip(what, shown(folder), f"found {n} others; {name}", n))
     if not found.files and not is_file(folder / STAMPS):
         return [], found.skips
-    stamps, skips = _stamps(folder / STAMPS, what)
+    stamps, skips = _stamps(folder / STAMPS, what, epoch_ns)
     skips += [
         Skip(what, shown(path), "no stamp for this frame")
         for number, path in found.files.items()
@@ -255,7 +271,7 @@ def _lidars(drive: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]]
     found: list[Lidar] = []
     skips: list[Skip] = []
     for name, one in about.all_lidars:
-        scans, lost = _scans(drive / "lidar" / name, one)
+        scans, lost = _scans(drive / "lidar" / name, one, about.epoch_ns)
         called = name if len(about.all_lidars) > 1 else ""
         found.append(Lidar(called, np.array(one.T_imu_lidar, np.float64), scans))
         skips += lost
@@ -265,8 +281,8 @@ def _lidars(drive: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]]
     return tuple(found), skips
 
 
-def _scans(folder: Path, about: LidarFile) -> tuple[tuple[Scan, ...], list[Skip]]:
-    found, skips = _stamped("scan", folder, ".bin")
+def _scans(folder: Path, about: LidarFile, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
+    found, skips = _stamped("scan", folder, epoch_ns, *frames.SCAN_SUFFIXES)
     scans = [
         Scan(path.stem, n, t, partial(_read_scan, path, t, about, frames.state_of(path)))
         for n, t, path in found
@@ -298,19 +314,19 @@ def _check_columns(rows: NDArray[np.float32], where: str) -> None:
 
 
 def _images(
-    folder: Path, folders: list[str], cameras: tuple[Camera, ...]
+    folder: Path, about: LogFile, cameras: tuple[Camera, ...]
 ) -> tuple[tuple[Image, ...], list[Skip]]:
-    """The images of all cameras; `folders` are those of several, or empty."""
+    """The images of all cameras; several have a folder each."""
     places = (
-        [(folder / name, camera) for name, camera in zip(folders, cameras, strict=True)]
-        if folders
+        [(folder / name, camera) for name, camera in zip(about.cameras, cameras, strict=True)]
+        if about.cameras
         else [(folder, cameras[0] if cameras else None)]
     )
     images: list[Image] = []
     skips: list[Skip] = []
     for place, camera in places:
         size, name = (None, "") if camera is None else (camera.image_size, camera.name)
-        found, lost = _stamped("image", place, *frames.IMAGE_SUFFIXES)
+        found, lost = _stamped("image", place, about.epoch_ns, *frames.IMAGE_SUFFIXES)
         of_camera = [Image(n, t, partial(frames.read_image, path, size), name) for n, t, path in found]
         images += in_order("image", of_camera, lost)
         skips += lost

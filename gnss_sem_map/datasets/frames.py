@@ -17,6 +17,8 @@ from gnss_sem_map.sensor_log import Skip
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """If a frame has two images, the first of these endings is read."""
+SCAN_SUFFIXES = (".bin", ".txt")
+"""Numbers of 32 bits, or text."""
 MOST_POINTS = 10_000_000
 FARTHEST_M, NEAREST_M = 1000.0, 1e-6
 """Range limit of LiDARs on roads; and coordinates nearer to zero, but not zero, are no measurements."""
@@ -69,7 +71,7 @@ def state_of(path: Path) -> State | None:
 
 
 def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDArray[np.float32]:
-    """Rows of little-endian float32 (n, columns).
+    """Rows of little-endian float32, or of text (n, columns).
 
     Raises DataError for a file that is cut short, empty, too large, or changed since its `state` was taken.
     """
@@ -85,6 +87,8 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
                 f"{shown(path)}: found {size} bytes, more than {MOST_POINTS} points; is it a scan?"
             )
         try:
+            if path.suffix.lower() == ".txt":
+                return _rows_of_text(file.readall(), columns, path)
             rows = np.empty((size // (4 * columns), columns), "<f4")
             if size == 0 or size != rows.nbytes or file.readinto(rows.data) != size:
                 raise DataError(
@@ -95,6 +99,35 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
             raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None
     refuse_other_bytes(rows, shown(path))
     return rows
+
+
+def _rows_of_text(content: bytes, columns: int, path: Path) -> NDArray[np.float32]:
+    try:
+        lines = [line for line in content.decode("ascii").split("\n") if line.strip()]
+        rows = (
+            np.loadtxt(lines, np.float32, comments=None, ndmin=2) if lines else np.empty((0, 0), np.float32)
+        )
+    except ValueError as error:
+        raise DataError(
+            f"{shown(path)}: no rows of {columns} numbers ({' '.join(str(error).split())[:100]})"
+        ) from None
+    if rows.shape[1] != columns:
+        raise DataError(
+            f"{shown(path)}: found {rows.shape[1]} numbers per line, expected {columns}; is it truncated?"
+        )
+    refuse_other_bytes(rows, shown(path))
+    return rows
+
+
+def first_size(files: Iterable[Path]) -> tuple[int, int] | None:
+    """(width, height) of the first image that can be read."""
+    for path in files:
+        try:
+            height, width = read_image(path, None).shape[:2]
+        except DataError:
+            continue
+        return width, height
+    return None
 
 
 def refuse_other_bytes(rows: NDArray[np.float32], where: str) -> None:

@@ -108,7 +108,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     scans, scan_skips = _scans(drive / "velodyne_points", stamps_ns, epoch_ns)
     names = [camera for camera in IMAGES if is_folder(root / "data_2d_raw" / name / camera / IMAGES[camera])]
     calibration = _calibration(about, names)
-    images, image_skips = _images(root / "data_2d_raw" / name, names, calibration, epoch_ns)
+    images, image_skips = _images(root / "data_2d_raw" / name, names, calibration, epoch_ns, stamps_ns)
     return SensorLog(
         name=shown(name),
         epoch_ns=epoch_ns,
@@ -148,14 +148,14 @@ def _scans(folder: Path, stamps_ns: dict[int, int], epoch_ns: int) -> tuple[tupl
 
 
 def _images(
-    folder: Path, names: list[str], calibration: Calibration, epoch_ns: int
+    folder: Path, names: list[str], calibration: Calibration, epoch_ns: int, of_scans: dict[int, int]
 ) -> tuple[tuple[Image, ...], list[Skip]]:
     images: list[Image] = []
     skips: list[Skip] = []
     for name, camera in zip(names, calibration.cameras, strict=True):
         found = frames.numbered("image", folder / name / IMAGES[name], *frames.IMAGE_SUFFIXES)
         of_camera, lost = kitti_raw.stamped_images(
-            found, folder / name, epoch_ns, camera.image_size, camera.name
+            found, folder / name, epoch_ns, camera.image_size, camera.name, of_scans
         )
         images += of_camera
         skips += lost

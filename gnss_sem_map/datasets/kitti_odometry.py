@@ -1,4 +1,4 @@
-"""KITTI odometry and SemanticKITTI sequences: `sequences/08` with poses in the camera frame.
+"""KITTI odometry and SemanticKITTI: `sequences/08` with poses in the camera frame, there or in `poses/08.txt`.
 
 Scans are motion-compensated to mid sweep. Line k of `poses.txt` and `times.txt` belongs to frame k; both usually cover
 more frames than there are scans. `poses.txt` are T_camera0_k in the frame of the first camera, so
@@ -29,6 +29,9 @@ SIX_DIGITS = 2e-4
 FARTHEST_M = 1e6
 
 
+CAMERAS = (2, 3, 0, 1)
+"""Colour left and right, grey left and right: the first that has a folder is used."""
+
 FORMAT, SIGNS = "kitti-odometry", "calib.txt and poses.txt (KITTI odometry, SemanticKITTI)"
 
 
@@ -40,24 +43,26 @@ def is_drive(drive: Path) -> bool:
 def read(sequence: Path, with_imu: bool = True) -> SensorLog:
     """Open an odometry sequence; raises DataError when calibration, poses or times are missing or malformed."""
     file = sequence / "calib.txt"
-    rows = kitti_calibration.read_rows(file, {"P2": 12, "Tr": 12})
+    camera = next((n for n in CAMERAS if is_folder(sequence / f"image_{n}")), CAMERAS[0])
+    rows = kitti_calibration.read_rows(file, {f"P{camera}": 12, "Tr": 12})
     Tr = rows["Tr"].reshape(3, 4)
     Tr = kitti_calibration.transform(Tr[:, :3], Tr[:, 3], f"{shown(file)}: Tr")
     times = _times(sequence / "times.txt")
-    poses = _poses(sequence / "poses.txt")
+    poses = _poses(_poses_file(sequence))
     if len(times) != len(poses):
         raise DataError(
             f"{shown(sequence)}: found {len(poses)} poses and {len(times)} times, expected as many;"
             " are poses.txt and times.txt of the same sequence?"
         )
     scan_files = frames.numbered("scan", sequence / "velodyne", ".bin")
-    image_files = frames.numbered("image", sequence / "image_2", *frames.IMAGE_SUFFIXES)
-    size = _image_size(image_files.files)
-    K, T_camera_camera0 = kitti_calibration.split_projection(rows["P2"], f"{shown(file)}: P2")
+    images = sequence / f"image_{camera}"
+    image_files = frames.numbered("image", images, *frames.IMAGE_SUFFIXES)
+    size = frames.first_size(image_files.files.values())
+    K, T_camera_camera0 = kitti_calibration.split_projection(rows[f"P{camera}"], f"{shown(file)}: P{camera}")
     cameras = () if size is None else (Camera(T_camera_camera0 @ Tr, K, size),)
     skips = [
         *_left_out("scan", sequence / "velodyne", len(poses), scan_files),
-        *_left_out("image", sequence / "image_2", len(poses), image_files),
+        *_left_out("image", images, len(poses), image_files),
     ]
     return SensorLog(
         name=f"sequence {shown(sequence.name)}",
@@ -80,6 +85,19 @@ def read(sequence: Path, with_imu: bool = True) -> SensorLog:
         ),
         given=Trajectory(times, _lidar_poses(poses, Tr)),
         skips=tuple(skips),
+    )
+
+
+def _poses_file(sequence: Path) -> Path:
+    """Of SemanticKITTI in the sequence; as KITTI odometry is downloaded, in `poses` beside `sequences`."""
+    name = sequence.resolve()
+    beside = name.parent.parent / "poses" / f"{name.name}.txt"
+    own = sequence / "poses.txt"
+    if is_file(own) or is_file(beside):
+        return own if is_file(own) else beside
+    raise DataError(
+        f"{shown(own)}: missing, and so is {shown(beside)}; expected one line of 12 numbers per frame; of a sequence"
+        " without poses, map the raw drive that it is from"
     )
 
 
@@ -172,14 +190,3 @@ def read_table(path: Path, columns: int) -> Array:
     if not rows:
         raise DataError(f"{shown(path)}: empty; expected one line of {columns} numbers per frame")
     return np.array(rows)
-
-
-def _image_size(files: dict[int, Path]) -> tuple[int, int] | None:
-    """(width, height) of the first image that can be read: the odometry calibration does not hold it."""
-    for path in files.values():
-        try:
-            height, width = frames.read_image(path, None).shape[:2]
-        except DataError:
-            continue
-        return width, height
-    return None

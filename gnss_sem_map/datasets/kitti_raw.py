@@ -1,4 +1,7 @@
-"""KITTI raw drives: `<date>/<date>_drive_<nnnn>_sync`, calibration in the date folder.
+"""KITTI raw drives: `<date>/<date>_drive_<nnnn>_sync` or `_extract`, calibration in the date folder.
+
+Of an `_extract` drive, scans are text, images are not rectified, and oxts has 100 Hz. One camera is used: the first of
+`CAMERAS` that has images.
 
 Facts that this reader relies on (measured on drives 0005 and 0009 of 2011_09_26): the sweep starts at the rear and
 turns clockwise; raw scans are not motion-compensated; the stamp of a scan is its middle; the image is exposed 8.5 ms
@@ -28,12 +31,16 @@ from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR, in_order, sweep_
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, read_text, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
-from gnss_sem_map.sensor_log.cameras import Camera
+from gnss_sem_map.sensor_log.cameras import Camera, Distortion
 
 Array = NDArray[np.float64]
 STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
 MOST_ROW_BYTES = 10_000
 
+CAMERAS = ("02", "03", "00", "01")
+"""Colour left and right, grey left and right."""
+MOST_FIXES_PER_S = 10.0
+"""More often, the unit repeats its own errors: of 100 Hz every tenth row is a fix, as in a `_sync` drive."""
 CAMERA_TIME_OFFSET_S = -0.0085
 ATTITUDE_STDDEVS_RAD = np.array([0.005, 0.005, 0.01])
 """Standard deviations of the unit's first roll, pitch, yaw; with a larger one a short track rotates the whole map."""
@@ -72,11 +79,12 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
 
     Without `with_imu`, the thousands of files of its `_extract` twin are not read.
     """
-    calibration = _calibration(date_folder(drive), has_images=is_folder(drive / "image_02"))
+    camera = _camera(drive)
+    calibration = _calibration(date_folder(drive), drive, camera)
     unit = navigation(drive, _twins(drive), with_imu)
     epoch_ns = unit.epoch_ns
     scans, scan_skips = _scans(drive, epoch_ns)
-    images, image_skips = _images(drive, epoch_ns, calibration.image_sizes.get(""))
+    images, image_skips = _images(drive / f"image_{camera}", epoch_ns, calibration.image_sizes.get(""))
     return SensorLog(
         name=shown(drive.name or drive.resolve().name),
         epoch_ns=epoch_ns,
@@ -125,6 +133,8 @@ def navigation(drive: Path, twins: tuple[Path, ...], with_imu: bool = True) -> N
         )
     fix_skips = [Skip("fix", shown(drive / "oxts"), f"{n} rows: {why}", n) for why, n in invalid.items()]
     epoch_ns = int(oxts_ns[0])
+    if np.median(np.diff(stamps)) < 0.5 / MOST_FIXES_PER_S:
+        is_fix &= np.diff(np.floor(stamps * MOST_FIXES_PER_S + 1e-3), prepend=-1.0) > 0
     fixes = oxts[is_fix]
     frame = LocalFrame(*(float(v) for v in fixes[0, [LAT, LON, ALT]]))
     accuracy = np.maximum(fixes[:, POSITION_ACCURACY], LEAST_ACCURACY_M)
@@ -151,30 +161,64 @@ def date_folder(drive: Path) -> Path:
     return drive.parent if has_calibration else drive.resolve().parent
 
 
-def _calibration(date: Path, has_images: bool) -> Calibration:
+def _camera(drive: Path) -> str:
+    """Number of the camera that is used: the first with images, else the first that has a folder, or empty."""
+    there = [camera for camera in CAMERAS if is_folder(drive / f"image_{camera}")]
+    seen = (camera for camera in there if _image_files(drive / f"image_{camera}").files)
+    return next(seen, there[0] if there else "")
+
+
+def _image_files(folder: Path) -> frames.Frames:
+    return frames.numbered("image", folder / "data", *frames.IMAGE_SUFFIXES)
+
+
+def _calibration(date: Path, drive: Path, camera: str) -> Calibration:
     T_lidar_imu = kitti_calibration.exact(lidar_from_imu(date))
     T_imu_lidar = np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
-    if not has_images:
+    if not camera:
         return Calibration(T_imu_lidar)
-    T_camera_lidar, K, size = camera_from_lidar(date)
-    camera = Camera(kitti_calibration.exact(T_camera_lidar), K, size, CAMERA_TIME_OFFSET_S)
-    return Calibration(T_imu_lidar, (camera,))
+    size = frames.first_size(_image_files(drive / f"image_{camera}").files.values())
+    return Calibration(T_imu_lidar, (camera_from_lidar(date, camera, size),))
 
 
-def camera_from_lidar(date: Path) -> tuple[Array, Array, tuple[int, int]]:
-    """T_camera_lidar (4, 4) of the rectified colour camera, K and (width, height), by the calibration of a date."""
+def camera_from_lidar(date: Path, camera: str = "02", seen: tuple[int, int] | None = None) -> Camera:
+    """A camera by the calibration of a date: rectified, unless images of a size `seen` are those of its sensor."""
     of_lidar, of_cameras = date / "calib_velo_to_cam.txt", date / "calib_cam_to_cam.txt"
     velo_to_cam = kitti_calibration.read_rows(of_lidar, {"R": 9, "T": 3})
-    cameras = kitti_calibration.read_rows(of_cameras, {"R_rect_00": 9, "P_rect_02": 12, "S_rect_02": 2})
+    T_camera0_lidar = kitti_calibration.transform(velo_to_cam["R"], velo_to_cam["T"], f"{shown(of_lidar)}: R")
+    rows = kitti_calibration.read_rows(
+        of_cameras, {"R_rect_00": 9, f"P_rect_{camera}": 12, f"S_rect_{camera}": 2}
+    )
+    size = kitti_calibration.image_size(rows[f"S_rect_{camera}"], f"{shown(of_cameras)}: S_rect_{camera}")
+    if seen is not None and seen != size:
+        raw = _sensor(of_cameras, camera, T_camera0_lidar)
+        if raw.image_size == seen:
+            return raw
     K, T_camera_camera0 = kitti_calibration.split_projection(
-        cameras["P_rect_02"], f"{shown(of_cameras)}: P_rect_02"
+        rows[f"P_rect_{camera}"], f"{shown(of_cameras)}: P_rect_{camera}"
     )
     T_camera0_rectified = kitti_calibration.transform(
-        cameras["R_rect_00"], np.zeros(3), f"{shown(of_cameras)}: R_rect_00"
+        rows["R_rect_00"], np.zeros(3), f"{shown(of_cameras)}: R_rect_00"
     )
-    T_camera0_lidar = kitti_calibration.transform(velo_to_cam["R"], velo_to_cam["T"], f"{shown(of_lidar)}: R")
-    size = kitti_calibration.image_size(cameras["S_rect_02"], f"{shown(of_cameras)}: S_rect_02")
-    return T_camera_camera0 @ T_camera0_rectified @ T_camera0_lidar, K, size
+    T = kitti_calibration.exact(T_camera_camera0 @ T_camera0_rectified @ T_camera0_lidar)
+    return Camera(T, K, size, CAMERA_TIME_OFFSET_S)
+
+
+def _sensor(of_cameras: Path, camera: str, T_camera0_lidar: Array) -> Camera:
+    """A camera whose images are not rectified."""
+    names = {f"{name}_{camera}": count for name, count in {"S": 2, "K": 9, "D": 5, "R": 9, "T": 3}.items()}
+    try:
+        S, K, D, R, T = kitti_calibration.read_rows(of_cameras, names).values()
+    except DataError as error:
+        raise DataError(
+            f"{error}; the images are not of the size S_rect_{camera}, as rectified ones are"
+        ) from None
+    T_camera_camera0 = kitti_calibration.transform(R, T, f"{shown(of_cameras)}: R_{camera}")
+    lens = Distortion(model="brown", coefficients=tuple(D.tolist()))
+    return Camera(
+        kitti_calibration.exact(T_camera_camera0 @ T_camera0_lidar), K.reshape(3, 3),
+        kitti_calibration.image_size(S, f"{shown(of_cameras)}: S_{camera}"), CAMERA_TIME_OFFSET_S, lens,
+    )  # fmt: skip
 
 
 def lidar_from_imu(date: Path) -> Array:
@@ -322,7 +366,7 @@ def quaternions(oxts: Array) -> Array:
 
 def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     folder = drive / "velodyne_points"
-    found = frames.numbered("scan", folder / "data", ".bin")
+    found = frames.numbered("scan", folder / "data", *frames.SCAN_SUFFIXES)
     if not found.files:
         return (), found.skips + _all_missing("scan", folder)
     (middle, skips), (start, in_start), (end, in_end) = (
@@ -365,19 +409,37 @@ def seconds_after(rows: NDArray[np.float32], stamp: float, start: float, end: fl
     return after.astype(np.float32)
 
 
-def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:
-    folder = drive / "image_02"
-    found = frames.numbered("image", folder / "data", *frames.IMAGE_SUFFIXES)
+def _images(
+    folder: Path, epoch_ns: int, size: tuple[int, int] | None
+) -> tuple[tuple[Image, ...], list[Skip]]:
+    found = _image_files(folder)
     if not found.files:
         return (), found.skips + _all_missing("image", folder)
     return stamped_images(found, folder, epoch_ns, size)
 
 
 def stamped_images(
-    found: frames.Frames, folder: Path, epoch_ns: int, size: tuple[int, int] | None, camera: str = ""
+    found: frames.Frames,
+    folder: Path,
+    epoch_ns: int,
+    size: tuple[int, int] | None,
+    camera: str = "",
+    of_scans: dict[int, int] | None = None,
 ) -> tuple[tuple[Image, ...], list[Skip]]:
-    """The images of a camera whose files were found and whose stamps are in its folder, and the skipped frames."""
-    stamps, skips = stamps_ns(folder / "timestamps.txt")
+    """The images of a camera whose files were found and whose stamps are in its folder, and the skipped frames.
+
+    Without stamps of their own, they have those `of_scans` of their numbers, which triggered them.
+    """
+    file = folder / "timestamps.txt"
+    if of_scans is not None and found.files and not is_file(file):
+        count = len(found.files)
+        told = f"missing: {count} images have the stamps of the scans of their numbers"
+        stamps, skips = (
+            {n: of_scans[n] for n in found.files if n in of_scans},
+            [Skip("stamps", shown(file), told, count)],
+        )
+    else:
+        stamps, skips = stamps_ns(file)
     skips += found.skips + frames.missing("image", folder, stamps, found.files)
     images = []
     for number, path in found.files.items():

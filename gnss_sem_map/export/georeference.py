@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS, VerticalCRS
-from pyproj.exceptions import CRSError, ProjError
+from pyproj.exceptions import CRSError
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.files.geoid import undulation
 
 WGS84_EPSG = 4326
 RIGHT_TO_M = 1.0
@@ -54,7 +55,7 @@ class Georeference:
                     " choose a CRS of that place"
                 )
         if self.geoid is not None and not np.isfinite(
-            _undulation(self.geoid).transform(*origin[::-1], 0.0)[2]
+            undulation(self.geoid).transform(*origin[::-1], 0.0)[2]
         ):
             raise ConfigError(
                 f"delivery.geoid: {self.geoid} does not cover the origin of the map at {_degrees(*origin)};"
@@ -65,7 +66,7 @@ class Georeference:
         """Points (n, 3) m of the map frame -> easting, northing, height (n, 3) m."""
         lat_deg, lon_deg, alt_m = self.frame.to_geodetic(p_map)
         if self.geoid is not None:
-            *_, alt_m = _undulation(self.geoid).transform(lon_deg, lat_deg, alt_m)
+            *_, alt_m = undulation(self.geoid).transform(lon_deg, lat_deg, alt_m)
         placed = np.stack([*_projection(self.horizontal_epsg).transform(lon_deg, lat_deg), alt_m], axis=-1)
         self._refuse_outside(placed, lat_deg, lon_deg)
         return placed
@@ -75,7 +76,7 @@ class Georeference:
         easting, northing, alt_m = np.moveaxis(np.asarray(p, np.float64), -1, 0)
         lon_deg, lat_deg = _projection(self.horizontal_epsg).transform(easting, northing, direction="INVERSE")
         if self.geoid is not None:
-            *_, alt_m = _undulation(self.geoid).transform(lon_deg, lat_deg, alt_m, direction="INVERSE")
+            *_, alt_m = undulation(self.geoid).transform(lon_deg, lat_deg, alt_m, direction="INVERSE")
         p_map = self.frame.to_map(lat_deg, lon_deg, alt_m)
         self._refuse_outside(p_map, lat_deg, lon_deg)
         return p_map
@@ -156,7 +157,7 @@ def check_delivery(epsg: int | None, geoid: Path | None) -> None:
     if epsg is not None:
         projected_crs(epsg)
     if geoid is not None:
-        _undulation(geoid)
+        undulation(geoid)
 
 
 @lru_cache(maxsize=16)
@@ -184,22 +185,6 @@ def projected_crs(epsg: int) -> CRS:
 @lru_cache(maxsize=16)
 def _projection(epsg: int) -> Transformer:
     return Transformer.from_crs(WGS84_EPSG, epsg, always_xy=True)
-
-
-@lru_cache(maxsize=16)
-def _undulation(geoid: Path) -> Transformer:
-    """Height above the ellipsoid to that above the geoid, at degrees."""
-    try:
-        return Transformer.from_pipeline(
-            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad"
-            f' +step +proj=vgridshift +grids="{geoid.resolve()}" +multiplier=-1'
-            " +step +proj=unitconvert +xy_in=rad +xy_out=deg"
-        )
-    except ProjError:
-        raise ConfigError(
-            f"delivery.geoid: {geoid}: expected a grid of geoid heights as PROJ reads them (.tif, .gtx),"
-            " in a path without quotes and commas"
-        ) from None
 
 
 def _vertical_crs(geoid: Path) -> CRS | None:

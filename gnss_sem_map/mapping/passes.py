@@ -65,6 +65,8 @@ class Together:
     passes: tuple[TwoPasses, ...]
     refused: int
     warnings: tuple[str, ...]
+    places: tuple[int, ...]
+    """Of each drive: so many were tried."""
 
 
 @one_blas_thread()
@@ -108,7 +110,8 @@ def bind_passes(
         for n in np.unique(inside.pairs.drives[bound.used]).tolist():
             corrections[group[n]] = bound.corrections[n]
         table += _table([names[n] for n in group], inside, bound)
-    return Together(corrections[: len(drives)], tuple(table), revisits.refused, tuple(warnings))
+    places = tuple(len(one.anchors) for one in passes)
+    return Together(corrections[: len(drives)], tuple(table), revisits.refused, tuple(warnings), places)
 
 
 def count_passes(together: Together, stats: RunStats) -> None:

@@ -16,7 +16,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,8 @@ class BoundDrives:
     passes: tuple[TwoPasses, ...] = ()
     warnings: tuple[str, ...] = ()
     failed: Mapping[str, str] = field(default_factory=dict)
+    places: Mapping[str, int] = field(default_factory=dict)
+    """Of each drive that was located: so many were tried."""
 
 
 def bind_drives(
@@ -89,26 +91,66 @@ def bind_drives(
     tracks: Mapping[str, KnownTrack],
     run: SeveralDrives,
     base: BaseCloud | None = None,
+    force: bool = False,
 ) -> BoundDrives:
     """Locate the drives that may have passed the same places, and bind those that did, and what is near a `base`.
 
-    `tracks` are of drives by name; a drive without one, or that cannot be located, is left as it is.
+    `tracks` are of drives by name; a drive without one, or that cannot be located, is left as it is. Raises DataError
+    where the base fits to none of them, unless by `force`: then it is a warning.
     """
     settings = run.settings
     if not (settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
+        if base is not None:
+            raise DataError(
+                f"{base.name}: nothing is held onto it without trajectory.revisits.enabled=true and"
+                " trajectory.lidar_odometry=true; set both, or leave --align-to out"
+            )
         return BoundDrives({})
     groups, reasons = _located_groups(sources, tracks, run, base)
     corrections: dict[str, Path] = {}
     passes: list[TwoPasses] = []
     warnings: list[str] = []
+    places: dict[str, int] = {}
     for group in groups:
         names = [name for name in group if name != BASE and not reasons[name]]
         found = _bound(names, settings, run.work, base if BASE in group else None)
         corrections |= found.corrections
         passes += found.passes
         warnings += found.warnings
+        places |= found.places
     failed = {name: reason for name, reason in reasons.items() if reason}
-    return BoundDrives(corrections, tuple(passes), tuple(warnings), failed)
+    bound = BoundDrives(corrections, tuple(passes), tuple(warnings), failed, places)
+    return bound if base is None else _with_unheld([one.name for one in sources], tracks, bound, base, force)
+
+
+def _with_unheld(
+    names: Sequence[str], tracks: Mapping[str, KnownTrack], bound: BoundDrives, base: BaseCloud, force: bool
+) -> BoundDrives:
+    """With a warning for each drive that a base does not hold; raises DataError where it fits to none."""
+    held, before = {base.name}, 0
+    while len(held) > before:  # by others, too
+        before = len(held)
+        held |= {
+            name for row in bound.passes if row.bound and held & {row.first, row.second}
+            for name in (row.first, row.second)
+        }  # fmt: skip
+    warnings, fits = [], len(held) > 1
+    for name in [name for name in names if name not in held]:
+        found = max(
+            (row.places for row in bound.passes if {row.first, row.second} == {name, base.name}), default=0
+        )
+        tried = bound.places.get(name, 0)
+        fits |= 0 < tried <= 2 * found  # of the right place, but too short a drive to hold it
+        fit = f"{found} of its {tried} places fit" if tried else "none of its places is near"
+        aside_m, below_m = base.beside(tracks[name].positions) if name in tracks else (np.nan, np.nan)
+        warnings.append(
+            f"{name}: not held onto {base.name}: {fit}; the cloud begins {aside_m:.1f} m"
+            f" aside of its track, and lies {abs(below_m):.1f} m {'above' if below_m < 0 else 'below'} it; is it of"
+            " this place, with heights above the ellipsoid, or the CRS of its heights?"
+        )
+    if warnings and not fits and not force:
+        raise DataError(f"{warnings[0]} correct it, leave --align-to out, or run with --force")
+    return replace(bound, warnings=(*bound.warnings, *warnings))
 
 
 def _located_groups(
@@ -222,7 +264,8 @@ def _bound(
             files[name] = work / BOUND / name / CORRECTION
             with writing_to(files[name].parent):
                 write_whole(files[name], npz_of(correction))
-    return BoundDrives(files, together.passes, together.warnings)
+    places = dict(zip(names, together.places, strict=True))
+    return BoundDrives(files, together.passes, together.warnings, places=places)
 
 
 def _read(folder: Path) -> LocatedDrive:

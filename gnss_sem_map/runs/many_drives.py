@@ -116,7 +116,7 @@ def run_drives(
         executor = held.enter_context(executor_of(workers, scheduler, claim.work, places))
         run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
         _begin(run, how.resume)
-        base = None if align_to is None else read_base(align_to, frame)
+        base = None if align_to is None else read_base(align_to, frame, settings.delivery.geoid)
         bound, failed = _bound_and_mapped(sources, how.force, run, base)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
@@ -138,7 +138,7 @@ def _bound_and_mapped(
     failed: dict[str, str] = {}
     while True:
         stay = [source for source in sources if source.name not in failed]
-        bound = bind_drives(stay, {name: tracks[name] for name in tracks.keys() - failed}, run, base)
+        bound = bind_drives(stay, {name: tracks[name] for name in tracks.keys() - failed}, run, base, force)
         # first those that failed before an interruption: the others may be done without them
         first = [source for source in stay if source.name in before]
         failing = map_all(first, bound, force, run)
@@ -238,11 +238,11 @@ def _changed(
     """Write the map of drives that were mapped before and of new ones; what is bound in another way is mapped again."""
     aligned_to = read_run(out).get("aligned_to")
     align_to = None if aligned_to is None else Path(aligned_to)
-    base = None if align_to is None else read_base(align_to, run.frame)
+    base = None if align_to is None else read_base(align_to, run.frame, run.settings.delivery.geoid)
     tracks = {name: _driven(folder) for name, folder in there.items()}
     tracks |= _tracks(added, run.frame, run.settings)
     known = [_source_of(name, folder) for name, folder in there.items()]
-    bound = bind_drives([*known, *added], tracks, run, base)
+    bound = bind_drives([*known, *added], tracks, run, base, force)
     for name in there:
         if name in bound.failed:
             raise DataError(

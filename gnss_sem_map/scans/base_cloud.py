@@ -27,6 +27,11 @@ class BaseCloud:
         near = np.sort(self._tree.query_ball_point(T_map_imu[:3, 3], FARTHEST_M)).astype(np.intp)
         return cloud_of((self.points[near] - T_map_imu[:3, 3]) @ T_map_imu[:3, :3])
 
+    def beside(self, track: Array) -> tuple[float, float]:
+        """How far aside of a track (n, 3) it begins, and how far below the track its nearest points lie, median, m."""
+        aside, nearest = cKDTree(self.points[:, :2]).query(track[:, :2])
+        return float(np.min(aside)), float(np.median(track[:, 2] - self.points[nearest, 2]))
+
     @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.points)

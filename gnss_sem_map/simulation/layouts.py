@@ -119,12 +119,14 @@ def _write_bag(drive: Path, log: SensorLog, out: Path, layout: Layout, progress:
     """Messages in the order of their stamps, as a recorder writes them."""
     with BagWriter(out, is_ros1=layout == "rosbag1") as bag:
         calibration = log.calibration
-        T_camera_lidar, K, size = kitti_raw.camera_from_lidar(kitti_raw.date_folder(drive))
+        camera = kitti_raw.camera_from_lidar(kitti_raw.date_folder(drive))
         T_lidar_imu = kitti_raw.lidar_from_imu(kitti_raw.date_folder(drive))
         imu_ns, imu = _imu_rows(drive)
         fix_ns, fixes, accuracy = _fixes(drive)
         start_ns = int(min(imu_ns[0], fix_ns[0]))
-        bag.write_transforms(start_ns, [("camera", "lidar", T_camera_lidar), ("lidar", "imu", T_lidar_imu)])
+        bag.write_transforms(
+            start_ns, [("camera", "lidar", camera.T_camera_lidar), ("lidar", "imu", T_lidar_imu)]
+        )
         attitudes = kitti_raw.quaternions(imu)
         events: list[Event] = []
         for k, ns in enumerate(imu_ns.tolist()):
@@ -136,7 +138,7 @@ def _write_bag(drive: Path, log: SensorLog, out: Path, layout: Layout, progress:
         for image in log.images:
             ns = _ns(log, image.stamp)
             events.append((ns, _later(bag.write_image, _file(image), IMAGE, "camera")))
-            events.append((ns, _later(bag.write_info, INFO, "camera", K, size)))
+            events.append((ns, _later(bag.write_info, INFO, "camera", camera.K, camera.image_size)))
         _write_in_order(events, progress)
     rig = {
         "imu": {

@@ -13,11 +13,15 @@ import numpy as np
 import street
 from faults import mutations
 from faults.fuzzing import Reader
+from pyproj import Transformer
+from receivers import LEAP_NS, gga, moment, pos_row, rmc
+from ros import START_NS
 
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.tum import write_tum
 from gnss_sem_map import config
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.gnss_files.time_systems import GPS_EPOCH_NS, WEEK_NS
 from gnss_sem_map.export.navigation import write_sbet
 from gnss_sem_map.labels import label_set, sensor_model
 from gnss_sem_map.voxels import tiles
@@ -45,6 +49,15 @@ def kitti(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     """A file of a KITTI raw drive."""
     drive = small_street(folder).drive
     return Reader((drive / name).resolve(), _whole_drive(drive), mutate)
+
+
+def scan_of_text(folder: Path) -> Reader:
+    """A scan as `_extract` drives of KITTI have it."""
+    drive = small_street(folder).drive
+    scan = min((drive / "velodyne_points/data").glob("*.bin"))
+    np.savetxt(scan.with_suffix(".txt"), np.fromfile(scan, "<f4").reshape(-1, 4), fmt="%.6g")
+    scan.unlink()
+    return Reader(scan.with_suffix(".txt"), _whole_drive(drive), mutations.text)
 
 
 def odometry(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
@@ -197,6 +210,36 @@ def given(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     else:
         write(poses, file)
     return Reader(file, lambda: open_drive(drive, trajectory=file), mutate)
+
+
+def positions(name: str, content: str, folder: Path) -> Reader:
+    """Positions of a receiver in a file of its own."""
+    from receivers import read
+
+    folder.mkdir(parents=True)
+    file = folder / name
+    file.write_text(content)
+    return Reader(file, lambda: read(file), mutations.text)
+
+
+def cloud(suffix: str, point_format: int, folder: Path) -> Reader:
+    """A georeferenced point cloud that drives are held onto."""
+    import laspy
+    from pyproj import CRS
+
+    from gnss_sem_map.datasets.laz_cloud import read_base
+
+    folder.mkdir(parents=True)
+    file, header = folder / f"cloud{suffix}", laspy.LasHeader(point_format=point_format, version="1.4")
+    header.add_crs(CRS.from_epsg(street.FRAME.utm_epsg))
+    x, y = Transformer.from_crs(4326, street.FRAME.utm_epsg, always_xy=True).transform(
+        street.FRAME.lon_deg, street.FRAME.lat_deg
+    )
+    header.scales, header.offsets = np.full(3, 1e-3), np.floor([x, y, 0.0])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.random.default_rng(0).normal([[x], [y], [street.FRAME.alt_m]], 20.0, (3, 500))
+    las.write(file)
+    return Reader(file, lambda: read_base(file, street.FRAME), mutations.binary)
 
 
 def settings(folder: Path) -> Reader:
@@ -371,6 +414,16 @@ def checkpoint(suffix: str, folder: Path) -> Reader:
     return Reader(file, lambda: read_checkpoint(file), mutations.binary)
 
 
+FIXES = [START_NS + k * 10**9 for k in range(20)]
+SOLUTION = (
+    "% GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s)\n"
+)
+EXPORT = """Project:     loop
+   Week   GPSTime       Latitude      Longitude     H-Ell SDNorth SDEast SDHeight Q
+(weeks)     (sec)     (+/-D M S)     (+/-D M S)       (m)     (m)    (m)      (m)
+"""
+WEEK, SECONDS = divmod((START_NS + LEAP_NS - GPS_EPOCH_NS) // 10**9, WEEK_NS // 10**9)
+
 READERS: dict[str, Callable[[Path], Reader]] = {
     "oxts row": functools.partial(kitti, "oxts/data/0000000002.txt", mutations.text),
     "oxts stamps": functools.partial(kitti, "oxts/timestamps.txt", mutations.text),
@@ -391,6 +444,7 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "URDF": robot,
     "scan of four columns": functools.partial(kitti, "velodyne_points/data/0000000000.bin", mutations.floats),
     "scan of five columns": scan,
+    "scan of text": scan_of_text,
     "PNG": functools.partial(picture, ".png", mutations.png),
     "JPEG": functools.partial(picture, ".jpg", mutations.binary),
     "label PNG": label_image,
@@ -400,6 +454,36 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "poses in TUM": functools.partial(given, "poses.tum", mutations.text),
     "poses in Parquet": functools.partial(given, "poses.parquet", mutations.parquet),
     "poses in SBET": functools.partial(given, "poses.sbet", mutations.floats),
+    "RTKLIB": functools.partial(
+        positions, "a.pos", SOLUTION + "\n".join(pos_row(ns + LEAP_NS) for ns in FIXES)
+    ),
+    "RTKLIB, baselines": functools.partial(
+        positions,
+        "a.LLH",
+        "% ref pos : 49.0 8.4 150.0\n%  GPST;e-baseline(m);n-baseline(m);u-baseline(m);Q\n"
+        + "".join(
+            f"{moment(ns + LEAP_NS):%Y/%m/%d %H:%M:%S.000};1.5;2.5;3.5;1;9;0.1;0.1;0.1;0;0;0\n"
+            for ns in FIXES
+        ),
+    ),
+    "NMEA": functools.partial(positions, "a.nmea", "".join(rmc(ns) + gga(ns) for ns in FIXES)),
+    "Inertial Explorer": functools.partial(
+        positions,
+        "a.txt",
+        EXPORT
+        + "".join(
+            f"{WEEK} {SECONDS + k} 49 00 0{k % 10}.5 8 24 00.1 160.1 0.1 0.1 0.2 1\n" for k in range(20)
+        ),
+    ),
+    "CSV of positions": functools.partial(
+        positions,
+        "a.csv",
+        "Time;Lat;Lon;H-Ell;sdE;sdN;sdU\n"
+        + "".join(f"{moment(ns).isoformat()};49,0;8,4;160,1;0,1;0,1;0,2\n" for ns in FIXES),
+    ),
+    "LAS": functools.partial(cloud, ".las", 6),
+    "LAZ": functools.partial(cloud, ".laz", 7),
+    "LAZ before 1.4": functools.partial(cloud, ".laz", 1),
     "settings": settings,
     "--set": one_setting,
     "segmenter": segmenter,

@@ -219,8 +219,8 @@ def test_a_drive_has_gaps_where_it_may_have_been_elsewhere(days: list[Path]) -> 
         assert many_drives._has_gaps(with_fixes(gap))
 
 
-def write_base(drive: Path, path: Path) -> None:
-    """What a surveyor has of the first day: its points, exactly georeferenced."""
+def write_base(drive: Path, path: Path, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
+    """What a surveyor has of the first day: its points, exactly georeferenced, or shifted."""
     log, true = open_drive(drive, with_imu=False), truth_of(drive)
     assert log.frame is not None
     scans = [scan for scan in log.scans[::4] if true.start < scan.stamp - 0.1 and scan.stamp + 0.1 < true.end]
@@ -231,8 +231,45 @@ def write_base(drive: Path, path: Path) -> None:
     x, y = Transformer.from_crs(4326, log.frame.utm_epsg, always_xy=True).transform(lon_deg, lat_deg)
     header.scales, header.offsets = np.full(3, 1e-3), np.floor([x[0], y[0], alt_m[0]])
     las = laspy.LasData(header)
-    las.x, las.y, las.z = x, y, alt_m
+    las.x, las.y, las.z = (axis + shift for axis, shift in zip((x, y, alt_m), shift_m, strict=True))
     las.write(path)
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shift_m", "said"),
+    [
+        ((0.0, 0.0, -47.6), r"0 of its 3 places fit; the cloud begins 0\.\d m .* lies 4\d\.\d m below it"),
+        ((0.0, 0.0, 30.0), r"0 of its 3 places fit; the cloud begins 0\.\d m .* lies 29\.\d m above it"),
+        ((300.0, 300.0, 0.0), r"none of its places is near; the cloud begins \d{3}\.\d m aside of its track"),
+    ],
+)
+def test_a_cloud_that_fits_nowhere_is_refused_with_its_distance(
+    days: list[Path], tmp_path: Path, shift_m: tuple[float, float, float], said: str
+) -> None:
+    base, how = write_base(days[0], tmp_path / "base.laz", shift_m), replace(HOW, force=False)
+    with pytest.raises(DataError, match=rf"{days[1].name}: not held onto base\.laz: {said}.* --force"):
+        run_drives(days[1:], tmp_path / "out", Settings(), how, align_to=base)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_by_force_a_cloud_that_fits_nowhere_is_a_warning(days: list[Path], tmp_path: Path) -> None:
+    base = write_base(days[0], tmp_path / "base.laz", (300.0, 300.0, 0.0))
+    about = run_drives(days[1:], tmp_path / "out", Settings(), HOW, align_to=base).about
+    assert [text.partition(";")[0] for text in about["warnings"]] == [
+        f"{days[1].name}: not held onto base.laz: none of its places is near"
+    ]
+
+
+def test_without_odometry_nothing_is_held_onto_a_cloud(days: list[Path], tmp_path: Path) -> None:
+    base = write_base(days[0], tmp_path / "base.laz")
+    settings = Settings().changed("trajectory.revisits.enabled=false")
+    with pytest.raises(
+        DataError, match=r"base\.laz: nothing is held onto it without trajectory\.revisits\.enabled"
+    ):
+        run_drives(days[1:], tmp_path / "out", settings, HOW, align_to=base)
 
 
 @pytest.mark.slow

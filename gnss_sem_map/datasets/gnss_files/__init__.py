@@ -1,12 +1,13 @@
-"""Positions of a receiver in a file of its own: RTKLIB .pos, NMEA, SBET.
+"""Positions of a receiver in a file of its own: RTKLIB .pos, NMEA, SBET, or a table with named columns.
 
-`GnssFile` says what the file does not: its clock, and how good its positions are. Positions become rows like those of
-gnss.csv, and errors of the clock are found where they leave no fix within the drive.
+What it is, is told by its content. `GnssFile` says what the file does not: its clock, the height of the geoid, and how
+good its positions are. Positions become rows like those of gnss.csv, and errors of the clock are found where they leave
+no fix within the drive.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,19 +16,18 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.receiver_rows import with_more
-from gnss_sem_map.datasets.gnss_files import nmea, rtklib, sbet
+from gnss_sem_map.datasets.gnss_files import named_columns, nmea, rtklib, sbet
 from gnss_sem_map.datasets.gnss_files.positions import Positions
 from gnss_sem_map.datasets.gnss_files.time_systems import LEAP_S, gps_minus_utc_s
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.files.geoid import undulation
+from gnss_sem_map.files.untrusted import is_file, read_lines, shown
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
 
-READERS = {
-    ".pos": rtklib.read, ".nmea": nmea.read, ".nma": nmea.read, ".ubx": nmea.read, ".txt": nmea.read,
-    ".log": nmea.read, ".sbet": sbet.read, ".out": sbet.read,
-}  # fmt: skip
+OF_NMEA, OF_SBET = (".nmea", ".nma", ".ubx"), (".sbet", ".out")
+"""Endings that say what a file is, whatever is in it."""
 LONGEST_OFFSET_S = 14 * 3600
 
 
@@ -37,7 +37,7 @@ class GnssFile(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     path: str = Field(
-        description="Beside the file that names it: .pos (RTKLIB), .nmea, or .sbet or .out (SBET)."
+        description="Beside the file that names it: RTKLIB, NMEA, a table with named columns, or .sbet or .out (SBET)."
     )
     time: Literal["utc", "gps"] | None = Field(
         None, description="Time system of its stamps; default: as the file says; NMEA utc, SBET gps."
@@ -49,6 +49,10 @@ class GnssFile(BaseModel):
     accuracy: str | None = Field(None, description="SBET: the file of its errors (smrmsg).")
     stddevs_m: tuple[float, float, float] | None = Field(
         None, description="East, north, up, m; default: by the file's deviations and quality flags."
+    )
+    geoid: float | str | None = Field(
+        None,
+        description="Height of the geoid above the ellipsoid, m, or its grid (.tif, .gtx), for heights above it.",
     )
 
 
@@ -72,16 +76,13 @@ def read_gnss_file(
     SBET and the day of an NMEA without dates. Raises DataError for a file that is none of these, or not of the drive.
     """
     path = _inside(folder, about.path)
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
-        raise DataError(
-            f"{shown(path)}: found the ending {path.suffix!r}, expected one of {', '.join(READERS)}"
-        )
     accuracy = None if about.accuracy is None else _inside(folder, about.accuracy)
     ahead_ns = round(about.utc_offset_s * 1e9)
     # the middle of the drive by the clock of the file
     near_ns = None if drive_ns is None else sum(drive_ns) // 2 + ahead_ns
-    found = reader(path, near_ns, accuracy, about.stddevs_m is not None)
+    found = _above_ellipsoid(
+        path, _read(path, near_ns, accuracy, about.stddevs_m is not None), about.geoid, folder
+    )
     stamps_ns = _on_unix_clock(found, about)
     if drive_ns is not None:
         _check_overlap(path, stamps_ns, drive_ns)
@@ -90,6 +91,49 @@ def read_gnss_file(
     rows = np.column_stack([(stamps_ns - zero) * 1e-9, found.geodetic, stddevs])
     more = found.more if about.stddevs_m is None else found.more | {"correlations": np.full((1, 3), np.nan)}
     return FileFixes(with_more(rows, **more), stamps_ns, found.skips)
+
+
+def _read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
+    """The positions of a file by the reader of its content."""
+    ending = path.suffix.lower()
+    if ending in OF_SBET:
+        return sbet.read(path, near_ns, accuracy, has_stddevs)
+    lines = read_lines(path)
+    if rtklib.is_solution(lines):
+        return rtklib.read(path, lines)
+    if ending in OF_NMEA or nmea.is_nmea(lines):
+        return nmea.read(path, lines, near_ns)
+    return named_columns.read(path, near_ns, has_stddevs)
+
+
+def _above_ellipsoid(path: Path, found: Positions, geoid: float | str | None, folder: Path) -> Positions:
+    """With heights above the ellipsoid; raises DataError where all are above a geoid whose height nothing tells."""
+    above = found.above_geoid
+    if above is None or not above.any():
+        return found
+    if geoid is None and above.all():
+        raise DataError(
+            f"{shown(path)}: heights are above the geoid, expected above the ellipsoid; set `geoid:` to the height of"
+            " the geoid there, m, or to its grid (.tif, .gtx)"
+        )
+    if geoid is None:
+        why = f"{int(above.sum())} fixes: height above a geoid of unknown height; `geoid:` tells it"
+        found.skips.append(Skip("fix", shown(path), why, int(above.sum())))
+        more = {name: values[~above] for name, values in found.more.items()}
+        return replace(
+            found, stamps_ns=found.stamps_ns[~above], geodetic=found.geodetic[~above], stddevs=found.stddevs[~above],
+            more=more,
+        )  # fmt: skip
+    lat, lon, height = found.geodetic.T
+    if isinstance(geoid, str):
+        *_, raised = undulation(_inside(folder, geoid), "geoid").transform(
+            lon, lat, height, direction="INVERSE"
+        )
+        if not np.isfinite(raised[above]).all():
+            raise DataError(f"{shown(path)}: the grid {geoid[:100]} does not cover its positions")
+    else:
+        raised = height + geoid
+    return replace(found, geodetic=np.column_stack([lat, lon, np.where(above, raised, height)]))
 
 
 def _inside(folder: Path, name: str) -> Path:

@@ -1,8 +1,9 @@
-"""NMEA 0183: positions of GGA, dates of RMC or ZDA, standard deviations of GST, speed and course of RMC or VTG.
+"""NMEA 0183: positions of GGA or GNS, else of RMC, dates of RMC or ZDA, standard deviations of GST, speed and course.
 
 And headings of HDT or THS. Parsed by `pynmeagps`. VTG, HDT and THS have no time: it is that of the sentence before.
 
-GGA's height is above the geoid; with the geoid's own height, which it also tells, it is above the ellipsoid.
+Heights are above the geoid; with the geoid's own height, which GGA and GNS also tell, they are above the ellipsoid. RMC
+tells none: then the trajectory is one of two dimensions, at a height of 0 m.
 """
 
 from __future__ import annotations
@@ -22,14 +23,23 @@ from numpy.typing import NDArray
 from gnss_sem_map.datasets.gnss_files.positions import Positions
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, WEEK_NS, nearest
 from gnss_sem_map.errors import DataError, how_to_install
-from gnss_sem_map.files.untrusted import read_lines, shown
+from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.sensor_log import Skip
 
 STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0.3, 0.5)}
 """Horizontal and vertical, m, at a HDOP of 1: autonomous, differential, PPS, fixed and float RTK. Other qualities are
 no measurements: 0 none, 6 dead reckoning, 7 entered by hand, 8 simulated."""
-USED = ("GGA", "RMC", "ZDA", "GST", "VTG", "HDT", "THS")
-SENTENCE = re.compile(rf"\$([A-Z]{{2}}(?:{'|'.join(USED)}),[^$*\r\n]*)(?:\*([0-9A-Fa-f]{{2}}))?")
+MODES = {"R": 4, "F": 5, "P": 2, "D": 2, "A": 1}
+"""Quality of a mode of GNS, of which each system has one, and of RMC; the best counts. Others are no measurements."""
+FLAT_STDDEV_M = 100.0
+"""Of the height 0 m of a fix without one."""
+USED = {
+    "GGA": "time lat lon quality HDOP alt sep", "GNS": "time lat lon posMode HDOP alt sep",
+    "RMC": "time status lat lon spd cog date", "ZDA": "time day month year", "GST": "time stdLat stdLong stdAlt",
+    "VTG": "cogt sogn", "HDT": "headingT", "THS": "headt mi",
+}  # fmt: skip
+"""Sentences, and their fields that are read; one without some of them was cut."""
+SENTENCE = re.compile(rf"\$([A-Z]{{2}}(?:{'|'.join(USED)}),[^$*\r\n]*)(?:\*([0-9A-Fa-f]{{1,2}}))?")
 """What stands between $ and *, and the checksum behind it, if there is one."""
 TIMELESS = ("VTG", "HDT", "THS")
 MPS_PER_KNOT = 1852 / 3600
@@ -38,14 +48,17 @@ AT_REST_MPS = 0.1
 """Slower than this, receivers leave the course out."""
 
 
-def read(
-    path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool, lines: list[str] | None = None
-) -> Positions:
-    """The positions of a file; what is no fix is skipped and counted. Raises DataError where there is none.
+Fix = tuple[int, bool, list[float], bool]
+"""ns, of the day or since 1970, and which; position and its deviations, and whether the height is above the geoid."""
 
-    `lines`: its sentences, where they are not in a file.
-    """
-    del accuracy, has_stddevs
+
+def is_nmea(lines: list[str]) -> bool:
+    """Whether lines of text hold sentences that are read."""
+    return any(SENTENCE.search(line) for line in lines)
+
+
+def read(path: Path, lines: list[str], near_ns: int | None) -> Positions:
+    """The positions of a file; what is no fix is skipped and counted. Raises DataError where there is none."""
     if find_spec("pynmeagps") is None:
         raise DataError(f"{shown(path)}: NMEA needs pynmeagps; {how_to_install('ros')}")
     now: int | None = None  # by the last sentence with a date
@@ -53,9 +66,10 @@ def read(
     velocities: dict[int, tuple[float, float]] = {}
     headings: dict[int, float] = {}
     clock: int | None = None  # of the last sentence with a time
-    fixes: list[tuple[int, bool, list[float]]] = []
+    fixes: list[Fix] = []
+    flat: list[Fix] = []
     lost: dict[str, int] = {}
-    for sentence in _sentences(read_lines(path) if lines is None else lines):
+    for sentence in _sentences(lines):
         if isinstance(sentence, str):
             lost[sentence] = lost.get(sentence, 0) + 1
             continue
@@ -67,39 +81,43 @@ def read(
             headings[clock] = heading
         if sentence.msgID in ("RMC", "ZDA"):
             now = _moment_ns(sentence) or now
-            continue
         if sentence.msgID == "GST" and clock is not None:
             deviations[clock] = (sentence.stdLong, sentence.stdLat, sentence.stdAlt)
-        elif sentence.msgID == "GGA":
+        elif sentence.msgID in ("GGA", "GNS", "RMC"):
             why = _fault(sentence, clock)
-            if why:
+            if why and sentence.msgID != "RMC":
                 lost[why] = lost.get(why, 0) + 1
-            elif clock is not None:
+            elif not why and clock is not None:
                 stamp = clock if now is None else clock + round((now - clock) / DAY_NS) * DAY_NS
-                fixes.append((stamp, now is not None, _position(sentence)))
+                one = (stamp, now is not None, *_position(sentence))
+                (flat if sentence.msgID == "RMC" else fixes).append(one)
     skips = [Skip("fix", shown(path), f"{count} sentences: {why}", count) for why, count in lost.items()]
+    if flat and not fixes:
+        told = f"{len(flat)} fixes of RMC have none: taken as 0 m; the trajectory is one of two dimensions"
+        skips.append(Skip("height", shown(path), told, len(flat)))
+        fixes, deviations = flat, {}
     if not fixes:
         raise DataError(
-            f"{shown(path)}: found no GGA sentence with a fix"
+            f"{shown(path)}: found no GGA, GNS or RMC sentence with a fix"
             + (f" ({'; '.join(skip.reason for skip in skips)})" if skips else "; expected NMEA 0183")
         )
     found = _joined(path, fixes, deviations, near_ns, skips)
-    flat = np.array([velocities.get(int(stamp % DAY_NS), (np.nan, np.nan)) for stamp in found.stamps_ns])
-    up = np.full(len(flat), np.nan)
+    level = np.array([velocities.get(int(stamp % DAY_NS), (np.nan, np.nan)) for stamp in found.stamps_ns])
+    up = np.full(len(level), np.nan)
     found.more["headings_deg"] = np.array([headings.get(int(s % DAY_NS), np.nan) for s in found.stamps_ns])
-    found.more["velocities"] = np.column_stack([flat, up])
+    found.more["velocities"] = np.column_stack([level, up])
     return found
 
 
 def _joined(
     path: Path,
-    fixes: list[tuple[int, bool, list[float]]],
+    fixes: list[Fix],
     deviations: dict[int, tuple[float, float, float]],
     near_ns: int | None,
     skips: list[Skip],
 ) -> Positions:
-    dated = np.array([is_dated for _, is_dated, _ in fixes])
-    stamps = np.array([stamp for stamp, _, _ in fixes], np.int64)
+    dated = np.array([is_dated for _, is_dated, *_ in fixes])
+    stamps = np.array([stamp for stamp, *_ in fixes], np.int64)
     if dated.any() and not dated.all():
         skips.append(Skip("fix", shown(path), "before the first date (RMC or ZDA)", int((~dated).sum())))
         fixes = [fix for fix in fixes if fix[1]]
@@ -110,15 +128,15 @@ def _joined(
         midnights = np.concatenate([[0], np.cumsum(np.diff(stamps) < -DAY_NS // 2)])
         stamps = nearest(stamps + midnights * DAY_NS, DAY_NS, near_ns)
     stamps = _of_this_era(stamps, near_ns if dated.any() else None, path, skips)
-    table = np.array([values for _, _, values in fixes])
+    table = np.array([[*values, is_above_geoid] for *_, values, is_above_geoid in fixes])
     best = _best(stamps, table, path, skips)
     stamps, table = stamps[best], table[best]
     given = [deviations.get(int(stamp % DAY_NS)) for stamp in stamps]
     stddevs = np.array([
         one if one is not None and all(isinstance(v, float) and v > 0 for v in one) else by_quality
-        for one, by_quality in zip(given, table[:, 3:].tolist(), strict=True)
+        for one, by_quality in zip(given, table[:, 3:6].tolist(), strict=True)
     ])  # fmt: skip
-    return Positions(stamps, table[:, :3], stddevs, "utc", skips)
+    return Positions(stamps, table[:, :3], stddevs, "utc", skips, above_geoid=table[:, 6] > 0)
 
 
 def _of_this_era(
@@ -191,15 +209,22 @@ def _sentences(lines: list[str]) -> Iterator[Any]:
 def _sentence(body: str, checksum: str) -> Any:
     from pynmeagps import NMEAReader, exceptions
 
+    if int(checksum, 16) != reduce(xor, body.encode("utf-8"), 0):
+        return "wrong checksum"
+    if body[2:5] == "GGA":  # the name of a station behind, which is to be a number, is not of interest
+        body = ",".join(body.split(",")[:13]) + ",,"
     try:
-        return NMEAReader.parse(f"${body}*{checksum}\r\n")
+        sentence = NMEAReader.parse(f"${body}*{checksum}\r\n", validate=0)
+        return (
+            sentence if all(map(sentence.__dict__.__contains__, USED[sentence.msgID].split())) else "damaged"
+        )
     except (
         exceptions.NMEAParseError,
         exceptions.NMEAMessageError,
         exceptions.NMEATypeError,
         ValueError,
-    ) as error:
-        return "wrong checksum" if "checksum" in str(error) else "damaged"
+    ):
+        return "damaged"
 
 
 def _moment_ns(sentence: Any) -> int | None:
@@ -227,16 +252,34 @@ def _clock_ns(time: Any) -> int | None:
     return seconds * 1_000_000_000 + time.microsecond * 1000
 
 
-def _fault(gga: Any, clock: int | None) -> str:
-    """Why a GGA is no fix; empty if it is one."""
-    if clock is None or gga.quality not in STDDEVS_M or not isinstance(gga.lat, float):
-        return f"no fix (quality {gga.quality})"
-    if not isinstance(gga.alt, float) or not isinstance(gga.sep, float):
-        return "no height, or none of the geoid: the height above the ellipsoid is unknown"
+def _quality(sentence: Any) -> int | None:
+    """As GGA has it; None where the sentence says otherwise that there is no fix."""
+    if sentence.msgID == "GGA":
+        return sentence.quality if sentence.quality in STDDEVS_M else None
+    if sentence.msgID == "RMC" and sentence.status != "A":
+        return None
+    modes = getattr(sentence, "posMode", "") or ("A" if sentence.msgID == "RMC" else "")  # NMEA before 2.3
+    known = [MODES[mode] for mode in modes if mode in MODES]
+    return min(known, key=lambda quality: STDDEVS_M[quality], default=None)
+
+
+def _fault(sentence: Any, clock: int | None) -> str:
+    """Why a sentence is no fix; empty if it is one."""
+    is_placed = isinstance(sentence.lat, float) and isinstance(sentence.lon, float)
+    if clock is None or _quality(sentence) is None or not is_placed:
+        return f"no fix (quality {getattr(sentence, 'quality', getattr(sentence, 'posMode', ''))})"
+    if sentence.msgID != "RMC" and not isinstance(sentence.alt, float):
+        return "no height"
     return ""
 
 
-def _position(gga: Any) -> list[float]:
-    across, up = STDDEVS_M[gga.quality]
-    dilution = max(gga.HDOP, 1.0) if isinstance(gga.HDOP, float) and gga.quality in (1, 2, 3) else 1.0
-    return [gga.lat, gga.lon, gga.alt + gga.sep, across * dilution, across * dilution, up * dilution]
+def _position(sentence: Any) -> tuple[list[float], bool]:
+    """Position and deviations of a fix, and whether its height is above the geoid."""
+    quality = _quality(sentence)
+    across, up = STDDEVS_M[quality or 1]
+    if sentence.msgID == "RMC":
+        return [sentence.lat, sentence.lon, 0.0, across, across, FLAT_STDDEV_M], False
+    dilution = max(sentence.HDOP, 1.0) if isinstance(sentence.HDOP, float) and quality in (1, 2, 3) else 1.0
+    separation = sentence.sep if isinstance(sentence.sep, float) else None
+    place = [sentence.lat, sentence.lon, sentence.alt + (separation or 0.0)]
+    return [*place, across * dilution, across * dilution, up * dilution], separation is None

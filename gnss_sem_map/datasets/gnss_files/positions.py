@@ -7,8 +7,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import Transformer
 
 from gnss_sem_map.sensor_log import Skip
+
+Array = NDArray[np.float64]
+STEP_S = 0.1
+"""Of a row in so many seconds: neighbouring ones of inertial units share their errors, and are no measurements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,11 +22,34 @@ class Positions:
 
     stamps_ns: NDArray[np.int64]
     """(n,) since 1970, in the file's own time system."""
-    geodetic: NDArray[np.float64]
-    """(n, 3) latitude and longitude °, height above the ellipsoid m."""
-    stddevs: NDArray[np.float64]
+    geodetic: Array
+    """(n, 3) latitude and longitude °, height m."""
+    stddevs: Array
     """(n, 3) east, north, up, m."""
     time: Literal["utc", "gps"]
     skips: list[Skip]
-    more: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    more: dict[str, Array] = field(default_factory=dict)
     """What else it tells, (n, 3) each, by the names of `receiver_rows.with_more`; NaN where a row does not."""
+    above_geoid: NDArray[np.bool_] | None = None
+    """(n,) of which the height is above the geoid; of the others it is above the ellipsoid."""
+
+
+def geodetic_of_ecef(places: Array) -> Array:
+    """Geocentric coordinates (n, 3) m as latitude, longitude °, height above the ellipsoid m."""
+    x, y, z = places.T
+    lon, lat, alt = Transformer.from_crs(4978, 4979, always_xy=True).transform(x, y, z)
+    return np.column_stack([lat, lon, alt])
+
+
+def enu_of_ecef(geodetic: Array) -> Array:
+    """R (n, 3, 3) that turns geocentric axes to east, north, up at places (n, 3)."""
+    lat, lon = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
+    zero = np.zeros(len(lat))
+    east = np.stack([-np.sin(lon), np.cos(lon), zero], axis=1)
+    up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    return np.stack([east, np.cross(up, east), up], axis=1)
+
+
+def thinned(seconds: Array) -> NDArray[np.intp]:
+    """The first row of every `STEP_S` of times that rise."""
+    return np.flatnonzero(np.diff(np.floor((seconds - seconds[0]) / STEP_S + 1e-6), prepend=-1.0) > 0)

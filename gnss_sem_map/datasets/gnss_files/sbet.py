@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gnss_sem_map.datasets.gnss_files.positions import Positions
+from gnss_sem_map.datasets.gnss_files.positions import STEP_S, Positions, thinned
 from gnss_sem_map.datasets.gnss_files.time_systems import (
     GPS_EPOCH_NS,
     WEEK_NS,
@@ -27,8 +27,6 @@ from gnss_sem_map.files.untrusted import read_bytes, shown
 Array = NDArray[np.float64]
 
 COLUMNS, ACCURACY_COLUMNS = 17, 10
-STEP_S = 0.1
-"""Of a row in so many seconds: neighbouring ones share their errors, and are no measurements of their own."""
 WEEK_S = 7 * 86_400.0
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FRD_OF_FLU = np.diag([1.0, -1.0, -1.0])
@@ -45,7 +43,7 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
         raise DataError(
             f"{shown(path)}: an SBET does not tell its week, and no other sensor of this log does"
         )
-    kept = np.flatnonzero(np.diff(np.floor((seconds - seconds[0]) / STEP_S + 1e-6), prepend=-1.0) > 0)
+    kept = thinned(seconds)
     stamps = _gps_ns(seconds[kept], near_ns)
     stddevs = np.ones((len(kept), 3)) if accuracy is None else _stddevs(accuracy, seconds[kept])
     geodetic = np.column_stack([np.degrees(lat), np.degrees(lon), height])[kept]
@@ -69,6 +67,11 @@ def read_poses(path: Path, near_ns: int) -> tuple[NDArray[np.int64], Array, Arra
     return stamps - gps_minus_utc_s(stamps) * 1_000_000_000, geodetic, NED_OF_ENU.T @ R @ FRD_OF_FLU
 
 
+def over_weeks(seconds: Array) -> Array:
+    """Times of a week (n,) s that begin anew with the next one, going on."""
+    return seconds + WEEK_S * np.cumsum(np.diff(seconds, prepend=seconds[:1]) < -WEEK_S / 2)
+
+
 def _gps_ns(seconds: Array, near_ns: int) -> NDArray[np.int64]:
     """Times of a week, s, as ns of GPS time since 1970."""
     return nearest(GPS_EPOCH_NS + np.round(seconds * 1e9).astype(np.int64), WEEK_NS, near_ns)
@@ -90,9 +93,10 @@ def _rows(path: Path, columns: int) -> Array:
         raise DataError(
             f"{shown(path)}: found {len(content)} bytes, expected rows of {columns} doubles; is it truncated?"
         )
-    rows = np.frombuffer(content, "<f8").reshape(-1, columns)
-    steps = np.diff(rows[:, 0])
+    rows = np.frombuffer(content, "<f8").reshape(-1, columns).copy()
     with np.errstate(invalid="ignore"):
+        rows[:, 0] = over_weeks(rows[:, 0])
+        steps = np.diff(rows[:, 0])
         is_clock = (
             np.isfinite(rows[:, 0]).all() and (rows[:, 0] >= 0).all() and (rows[:, 0] < 2 * WEEK_S).all()
         )
@@ -106,6 +110,9 @@ def _rows(path: Path, columns: int) -> Array:
 def _stddevs(path: Path, seconds: Array) -> Array:
     """East, north, up (n, 3), m, at times of the week."""
     rows = _rows(path, ACCURACY_COLUMNS)
+    rows[:, 0] += WEEK_S * np.round(
+        (seconds[0] - rows[:, 0].mean()) / WEEK_S
+    )  # one may begin before the week
     if seconds[0] < rows[0, 0] - STEP_S * 20 or seconds[-1] > rows[-1, 0] + STEP_S * 20:
         raise DataError(f"{shown(path)}: does not cover the time of the SBET; is it of another drive?")
     return np.column_stack([np.interp(seconds, rows[:, 0], rows[:, column]) for column in (2, 1, 3)])

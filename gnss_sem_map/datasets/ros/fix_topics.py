@@ -88,7 +88,7 @@ def _of_sentences(
     name = "sentence" if messages.kind == SENTENCE else "data"
     lines = [str(getattr(decode(bag, messages, k), name)) for k in range(len(messages))]
     near_ns = int(np.median(said)) if len(said) else None
-    found = nmea.read(Path(messages.topic), near_ns, None, False, lines)
+    found = nmea.read(Path(messages.topic), lines, near_ns)
     stamps, skips = found.stamps_ns, found.skips
     are_fixes = [re.search(r"GGA(,[^,]*){5},[1-9]", line) is not None for line in lines]
     off_ns = round(float(np.median(said[are_fixes])) - float(np.median(stamps))) if any(are_fixes) else 0

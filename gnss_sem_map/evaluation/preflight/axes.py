@@ -168,8 +168,8 @@ def _described(matrix: Array) -> str:
     yaw = round(float(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))))
     if matrix[2, 2] > 0:
         ahead = {
-            180: "x points backwards",
-            -180: "x points backwards",
+            180: "x points backwards, or all of the drive is in reverse (then run with --force)",
+            -180: "x points backwards, or all of the drive is in reverse (then run with --force)",
             90: "x points left",
             -90: "x points right",
         }

@@ -21,6 +21,9 @@ SAME_PLACE_M = 1e-3
 FROZEN_S, FROZEN_FIXES = 2.0, 3
 # What a car brakes or speeds up with at most, m/s², and what its speed may differ by besides, m/s.
 HARD_BRAKING, SPEED_MARGIN = 6.0, 1.0
+# Numbers per degree: four to six decimals, or three and four of minutes.
+ROUNDED_TO, DEGREE_M = (1e4, 6e4, 1e5, 6e5, 1e6), 111_320.0
+FEWEST_PLACES = 5
 # Noise seldom exceeds so many times its median.
 SPIKE = 6.0
 # Who stands gains no speed by the accelerometer, m/s (rms about a slope, which is tilt and bias).
@@ -38,6 +41,8 @@ class Fixes:
     """Number of fixes that a vehicle cannot have reached."""
     frozen: Array
     """(k, 2) first and last stamp, s, of runs that stand still while the vehicle drives."""
+    grain_m: float
+    """Degrees are rounded to so many metres; 0 where they are finer than receivers are."""
     are_radians: bool
     moves_from_s: float
     """When the track first leaves its start; the first stamp where it never does."""
@@ -48,7 +53,8 @@ def examine(fixes: GnssFixes, frame: LocalFrame, imu: ImuSamples, max_speed_mps:
     credible = plausible(fixes, max_speed_mps)
     kept = fixes[credible]
     kept = kept[~_spikes(kept)]
-    frozen = frozen_runs(kept, imu, frame.gravity)
+    grain = grain_m(kept, frame)
+    frozen = frozen_runs(kept, imu, frame.gravity, grain)
     thawed = np.ones(len(kept), dtype=bool)
     for first, last in frozen:
         thawed &= (kept.stamps < first) | (kept.stamps > last)
@@ -57,7 +63,7 @@ def examine(fixes: GnssFixes, frame: LocalFrame, imu: ImuSamples, max_speed_mps:
     are_radians = _look_like_radians(kept, frame)
     if are_radians:
         kept = replace(kept, positions=kept.positions * RADIANS)
-    return Fixes(kept, int(np.sum(~credible)), frozen, are_radians, _moves_from(fixes))
+    return Fixes(kept, int(np.sum(~credible)), frozen, grain, are_radians, _moves_from(fixes))
 
 
 def _spikes(fixes: GnssFixes) -> Mask:
@@ -92,20 +98,34 @@ def _moves_from(fixes: GnssFixes) -> float:
     return float(fixes.stamps[left[0] if len(left) else 0])
 
 
-def frozen_runs(fixes: GnssFixes, imu: ImuSamples, gravity: float) -> Array:
-    """Runs of one and the same position that the vehicle drove into, out of, or in: (k, 2) stamps, s."""
+def grain_m(fixes: GnssFixes, frame: LocalFrame) -> float:
+    """What latitude and longitude, or their minutes, were rounded to, m; 0 where to less than 0.1 m."""
+    lat, lon, _ = frame.to_geodetic(fixes.positions)
+    for per_degree in ROUNDED_TO:
+        units = np.stack([lat, lon]) * per_degree
+        whole = np.round(units)
+        if np.unique(whole, axis=1).shape[1] >= FEWEST_PLACES and np.abs(units - whole).max() < 1e-2:
+            return DEGREE_M / per_degree
+    return 0.0
+
+
+def frozen_runs(fixes: GnssFixes, imu: ImuSamples, gravity: float, grain: float = 0.0) -> Array:
+    """Runs of one and the same position that the vehicle drove into, out of, or in: (k, 2) stamps, s.
+
+    Where positions were rounded to a `grain`, m, they stay the same while it crawls, and then jump by it.
+    """
     steps = np.linalg.norm(np.diff(fixes.positions[:, :2], axis=0), axis=1)
     durations = np.diff(fixes.stamps)
     same = np.concatenate([[False], steps < SAME_PLACE_M, [False]])
     edges = np.flatnonzero(np.diff(same.astype(int)))
-    speeds = steps / durations
+    speeds = np.maximum(steps - np.sqrt(2) * grain, 0.0) / durations
     found = []
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         if last - first + 1 < FROZEN_FIXES or fixes.stamps[last] - fixes.stamps[first] < FROZEN_S:
             continue
         into = first > 0 and speeds[first - 1] > SPEED_MARGIN + HARD_BRAKING * durations[first - 1]
         out = last < len(speeds) and speeds[last] > SPEED_MARGIN + HARD_BRAKING * durations[last]
-        if into or out or _moves(imu, gravity, fixes.stamps[first], fixes.stamps[last]):
+        if into or out or (not grain and _moves(imu, gravity, fixes.stamps[first], fixes.stamps[last])):
             found.append((fixes.stamps[first], fixes.stamps[last]))
     return np.array(found).reshape(-1, 2)
 

@@ -40,6 +40,8 @@ WRONG_LAG_M = 2.0
 FIVE_SIGMA = 25.0
 # At a constant speed an antenna ahead is a clock that is early: up to here, m, it may be either.
 LEVER_ARM_M = 5.0
+# Positions that are rounded to more are told.
+COARSE_M = 0.5
 
 
 def check(sample: Sample) -> Iterator[Finding]:
@@ -150,6 +152,13 @@ def _break(fixes: GnssFixes, imu: ImuSamples) -> Iterator[Finding]:
 
 
 def _frozen(fixes: GnssFixes, found: Fixes) -> Finding:
+    if len(found.frozen) == 0 and found.grain_m > COARSE_M:
+        return amber(
+            "GNSS frozen",
+            f"positions come in steps of {found.grain_m:.2g} m",
+            "latitude and longitude were rounded: the vehicle jumps from step to step",
+            "write them with 8 decimals of degrees",
+        )
     if len(found.frozen) == 0:
         return green("GNSS frozen", "no position is repeated while the vehicle drives")
     first, last = found.frozen[int(np.argmax(np.ptp(found.frozen, axis=1)))]

@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 # Of a drive, the median |f| is gravity to a few per cent, at rest and moving; a hand-held unit's to ten.
 SAME_UNIT = 1.15
+# Gravity is in the mean of f over a drive; without it, accelerating and braking cancel each other.
+LEAST_MEAN = 0.5
 # No road vehicle turns like this, rad/s, for a hundredth of its time, nor all the time; nor does who carries the unit.
 RARE_RATE, USUAL_RATE = 6.0, 2.0
 # Over so long, s, a body that the gyroscope leans by more than the first, rad, leans by the second by its force, too.
@@ -26,6 +28,14 @@ def force_unit(force: Array, gravity: float) -> tuple[str, Finding]:
     size = float(np.median(np.linalg.norm(force, axis=1)))
     evidence = f"median |f| is {size:.4g}, gravity here is {gravity:.3f} m/s²"
     unit = min(FORCE_UNITS, key=lambda name: _ratio(size * FORCE_UNITS[name], gravity))
+    mean = float(np.linalg.norm(force.mean(axis=0)))
+    if mean < LEAST_MEAN * size and _ratio(size, gravity) > SAME_UNIT:
+        return "m/s2", red(
+            "IMU force unit",
+            f"{evidence}; the mean of f over the drive is {mean:.2g}",
+            "gravity was taken out of the force, as of a linear acceleration",
+            "give ax, ay, az as the accelerometer measures them: 9.81 m/s² upwards at rest",
+        )
     if _ratio(size * FORCE_UNITS[unit], gravity) > SAME_UNIT:
         return "m/s2", red(
             "IMU force unit",

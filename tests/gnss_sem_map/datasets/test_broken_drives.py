@@ -105,8 +105,8 @@ def test_a_broken_sequence_is_refused(
 @pytest.mark.parametrize(
     ("name", "old", "new", "says"),
     [
-        ("imu.csv", "stamp_s,ax", "time,ax", "imu.csv:.*expected numbers in columns stamp_s,ax"),
-        ("gnss.csv", "std_u_m", "sigma_u", "gnss.csv:.*expected numbers"),
+        ("imu.csv", "stamp_s,ax", "when,ax", "imu.csv:.*expected numbers in columns stamp_s,ax"),
+        ("gnss.csv", "std_u_m", "quality_u", "gnss.csv:.*expected numbers"),
         ("log.yaml", '"K"', '"k"', "log.yaml: k: .*known keys are"),
         ("log.yaml", '"image_size": [300, 96], ', "", "a camera needs all of"),
     ],

@@ -197,3 +197,26 @@ def test_opencv_style_yaml_without_spaces_is_read(drive: Path) -> None:
     path = root_of(drive) / "calibration" / "image_02.yaml"
     path.write_text(path.read_text().replace(": ", ":"))
     assert open_drive(drive).calibration.camera("image_02").distortion is not None
+
+
+@pytest.mark.parametrize("without", [["image_00"], CAMERAS])
+def test_images_without_stamps_have_those_of_the_scans_of_their_numbers(
+    drive: Path, without: list[str]
+) -> None:
+    """Their stamps are a download of their own; the LiDAR triggers the cameras."""
+    plain = open_drive(drive)
+    for camera in without:
+        (root_of(drive) / "data_2d_raw" / drive.name / camera / "timestamps.txt").unlink()
+    found = open_drive(drive)
+    assert len(found.images) == len(plain.images)
+    of_scans = {scan.number: scan.stamp for scan in found.scans}
+    for image in found.images:
+        if image.camera in without:
+            assert image.stamp == pytest.approx(of_scans[image.number], abs=1e-9)
+    told = [skip for skip in found.skips if "have the stamps of the scans" in skip.reason]
+    assert len(told) == len(without)
+
+
+def test_the_root_of_the_data_set_offers_its_drives(drive: Path) -> None:
+    with pytest.raises(DataError, match=f"a folder of drives; .*: {drive}"):
+        open_drive(root_of(drive))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
+from laspy.vlrs.known import GeoKeyDirectoryVlr
 from numpy.typing import NDArray
 from pyproj import CRS, Geod, Transformer
+from surfaces import write_geoid
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.datasets.laz_cloud import read_base
@@ -84,9 +87,10 @@ def test_what_is_no_base_is_refused_by_name(tmp_path: Path) -> None:
         read_base(write(tmp_path / "far.laz", around(metres)), LocalFrame(52.5, 13.4, 34.0))
     text = tmp_path / "text.laz"
     text.write_text("no cloud")
-    for path in (text, tmp_path / "absent.laz"):
-        with pytest.raises(DataError, match=f"{path.name}: cannot be read as LAS or LAZ"):
-            read_base(path, FRAME)
+    with pytest.raises(DataError, match=r"text\.laz: cannot be read as LAS or LAZ"):
+        read_base(text, FRAME)
+    with pytest.raises(DataError, match=r"absent\.laz: cannot read it"):
+        read_base(tmp_path / "absent.laz", FRAME)
 
 
 @pytest.mark.parametrize("kept", [0.5, -20])
@@ -109,3 +113,77 @@ def test_heights_above_a_geoid_that_is_not_there_are_refused(tmp_path: Path) -> 
         DataError, match=r"^\S*city\.laz: its heights are those of EGM96 height, .* ellipsoid"
     ):
         read_base(tmp_path / "city.laz", FRAME)
+
+
+FEET, SURVEY_FEET = 0.3048, 1200 / 3937
+IN_TEXAS = LocalFrame(30.27, -97.74, 150.0)
+
+
+def write_in(
+    crs: CRS | None, place: NDArray[np.float64], path: Path, keys: dict[int, int] | None = None
+) -> Path:
+    """One point by coordinates of a file, with its CRS as WKT, or as GeoTIFF keys."""
+    header = laspy.LasHeader(point_format=1, version="1.2")
+    header.scales, header.offsets = np.full(3, 1e-4), np.floor(place)
+    if crs is not None:
+        header.add_crs(crs)
+    if keys:
+        directory = GeoKeyDirectoryVlr()
+        rows = [(1, 1, 0, len(keys)), *((key, 0, 1, value) for key, value in sorted(keys.items()))]
+        directory.parse_record_data(np.array(rows, "<u2").tobytes())
+        header.vlrs.append(directory)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = place[:, None]
+    las.write(path)
+    return path
+
+
+@pytest.mark.parametrize(("epsg", "unit_m"), [(2277, SURVEY_FEET), (32614, 1.0), (4979, 1.0)])
+def test_heights_are_in_the_unit_of_the_coordinates(tmp_path: Path, epsg: int, unit_m: float) -> None:
+    x, y = Transformer.from_crs(4326, epsg, always_xy=True).transform(IN_TEXAS.lon_deg, IN_TEXAS.lat_deg)
+    file = write_in(CRS.from_epsg(epsg), np.array([x, y, 153.0 / unit_m]), tmp_path / "feet.laz")
+    assert abs(read_base(file, IN_TEXAS).points[0, 2] - 3.0) < 1e-3
+
+
+@pytest.mark.parametrize(("code", "unit_m"), [(9001, 1.0), (9002, FEET), (9003, SURVEY_FEET)])
+def test_a_unit_of_their_own_counts_for_heights(tmp_path: Path, code: int, unit_m: float) -> None:
+    x, y = Transformer.from_crs(4326, 2277, always_xy=True).transform(IN_TEXAS.lon_deg, IN_TEXAS.lat_deg)
+    keys = {1024: 1, 3072: 2277, 4099: code}
+    file = write_in(None, np.array([x, y, 153.0 / unit_m]), tmp_path / "keys.las", keys)
+    assert abs(read_base(file, IN_TEXAS).points[0, 2] - 3.0) < 1e-3
+
+
+@pytest.mark.parametrize("keys", [{3072: 32614, 4096: 5703}, {3072: 2277, 4096: 6360, 4099: 9003}])
+def test_heights_above_a_geoid_by_a_geotiff_key_need_its_grid(tmp_path: Path, keys: dict[int, int]) -> None:
+    """laspy reads only the CRS of the plane; without the key the cloud would stand 26 m too low."""
+    x, y = Transformer.from_crs(4326, keys[3072], always_xy=True).transform(
+        IN_TEXAS.lon_deg, IN_TEXAS.lat_deg
+    )
+    unit_m = SURVEY_FEET if 4099 in keys else 1.0
+    file = write_in(None, np.array([x, y, 179.0 / unit_m]), tmp_path / "navd.las", {1024: 1, **keys})
+    with pytest.raises(DataError, match=r"navd\.las: its heights are those of NAVD88 height.*--geoid"):
+        read_base(file, IN_TEXAS)
+    grid = write_geoid(tmp_path / "geoid.tif", IN_TEXAS.lat_deg, IN_TEXAS.lon_deg, -26.0)
+    assert abs(read_base(file, IN_TEXAS, grid).points[0, 2] - 3.0) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("at", "form", "count"),
+    [
+        (100, "<I", 3_400_000_000),
+        (247, "<Q", 3_400_000_000),
+        (243, "<I", 3_400_000_000),
+        (96, "<I", 3_400_000_000),
+    ],
+)
+def test_a_header_that_counts_more_than_the_file_has_is_refused_before_memory(
+    tmp_path: Path, at: int, form: str, count: int
+) -> None:
+    path = write(tmp_path / "base.las", around(np.zeros((10, 3))))
+    content = bytearray(path.read_bytes())
+    struct.pack_into(form, content, at, count)
+    path.write_bytes(content)
+    with pytest.raises(
+        DataError, match=r"base\.las: its .* need \d+ bytes, and there are \d+; is it truncated\?"
+    ):
+        read_base(path, FRAME)

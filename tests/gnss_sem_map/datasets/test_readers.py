@@ -215,7 +215,7 @@ def test_wheel_speeds_are_read_and_their_bad_rows_reported(small_drive: Street, 
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ("stamp_s,speed\n0,1\n", "wheels.csv:.*columns stamp_s,speed_mps"),
+        ("stamp_s,gear\n0,1\n", "wheels.csv:.*columns stamp_s,speed_mps"),
         ("stamp_s,speed_mps\n", "wheels.csv: no rows"),
         ("stamp_s,speed_mps\n0,fast\n", "wheels.csv:.*expected numbers"),
         ("stamp_s,speed_mps\n" + "".join(f"{50 * k},1\n" for k in range(9)), "wheels.csv:.*milliseconds"),
@@ -314,3 +314,43 @@ def test_calibration_beside_a_link_comes_first(small_drive: Street, copy: Path, 
     )
     with pytest.raises(DataError, match="calib_imu_to_velo"):
         open_drive(copy)
+
+
+def test_scans_and_tables_of_a_log_as_other_programs_write_them(
+    small_drive: street.Street, tmp_path: Path
+) -> None:
+    """Scans as text, and tables with semicolons, decimal commas and UTF-16: the same log to the last bit."""
+    plain = street.write_table_log(tmp_path / "plain", small_drive)
+    other = street.write_table_log(tmp_path / "other", small_drive)
+    for scan in (other / "lidar").glob("*.bin"):
+        np.savetxt(scan.with_suffix(".txt"), np.fromfile(scan, "<f4").reshape(-1, 5), fmt="%.9g")
+        scan.unlink()
+    for table in ("imu.csv", "gnss.csv", "lidar/stamps.csv", "images/stamps.csv"):
+        text = (other / table).read_text().replace(",", ";").replace(".", ",")
+        (other / table).write_bytes(text.replace("\n", "\r\n").encode("utf-16"))
+    one, two = open_drive(plain), open_drive(other)
+    assert one.imu is not None
+    assert two.imu is not None
+    np.testing.assert_array_equal(one.imu.specific_force, two.imu.specific_force)
+    assert one.gnss is not None
+    assert two.gnss is not None
+    np.testing.assert_array_equal(one.gnss.positions, two.gnss.positions)
+    assert [image.stamp for image in one.images] == [image.stamp for image in two.images]
+    for a, b in zip(one.scans, two.scans, strict=True):
+        assert a.stamp == b.stamp
+        np.testing.assert_array_equal(a.read().xyz, b.read().xyz)
+        np.testing.assert_array_equal(a.read().stamps, b.read().stamps)
+
+
+def test_a_unit_in_the_header_and_another_in_the_log_is_one_too_many(
+    small_drive: street.Street, tmp_path: Path
+) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    text = (drive / "imu.csv").read_text().replace("ax,ay,az", "ax [g],ay [g],az [g]")
+    (drive / "imu.csv").write_text(text)
+    about = json.loads((drive / "log.yaml").read_text()) | {"force_unit": "g"}
+    (drive / "log.yaml").write_text(json.dumps(about))
+    with pytest.raises(
+        DataError, match=r"imu\.csv: the unit of ax is in its header, and force_unit in log\.yaml"
+    ):
+        open_drive(drive)

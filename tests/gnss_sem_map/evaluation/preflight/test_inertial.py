@@ -67,6 +67,23 @@ CASES: dict[str, tuple[Array, Array, str, SensorConventions]] = {
 }
 
 
+@pytest.mark.parametrize("scale", [1.0, 4.0, 0.3])
+def test_a_force_without_gravity_is_not_called_g(right: SensorLog, scale: float) -> None:
+    """Whatever its size: of a hard drive its median is near 1, as of a force in g."""
+    assert right.imu is not None
+    imu = right.imu
+    linear = scale * (imu.specific_force - [0.0, 0.0, 9.81])
+    said = [str(f) for f in findings(replace(right, imu=ImuSamples(imu.stamps, linear, imu.angular_rate)))]
+    assert any("gravity was taken out of the force" in line for line in said)
+    assert not any("force_unit" in line for line in said)
+
+
+def test_a_drive_that_is_all_in_reverse_is_one_of_the_reasons(right: SensorLog) -> None:
+    turned = np.diag([-1.0, -1.0, 1.0])
+    said = [str(f) for f in findings(reporting(right, turned, turned)) if f.level is Level.RED]
+    assert any("or all of the drive is in reverse" in line for line in said)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_wrong_convention_is_named_and_its_setting_mends_it(name: str, right: SensorLog) -> None:
     force, rate, says, correction = CASES[name]

@@ -137,6 +137,22 @@ def test_a_frozen_receiver_is_told_from_a_standing_vehicle(
     assert any("frozen" in line for line in said)
 
 
+@pytest.mark.parametrize(("per_degree", "is_coarse"), [(1e5, True), (6e4, True), (6e5, False), (1e8, False)])
+def test_rounded_degrees_are_not_called_frozen(right: SensorLog, per_degree: float, is_coarse: bool) -> None:
+    """Five fixes a second, of which several have the same place at 10 km/h; four or five decimals are told."""
+    seen = fixes_of(right)
+    stamps = np.arange(seen.stamps[0], seen.stamps[-1], 0.2)
+    positions = np.column_stack([np.interp(stamps, seen.stamps, axis) for axis in seen.positions.T])
+    lat, lon, alt = FRAME.to_geodetic(positions)
+    rounded = FRAME.to_map(
+        np.round(lat * per_degree) / per_degree, np.round(lon * per_degree) / per_degree, alt
+    )
+    log = replace(right, gnss=GnssFixes(stamps, rounded, np.full((len(stamps), 3), 2.0)))
+    found = [each for each in findings(log) if each.check == "GNSS frozen"]
+    assert [each.level for each in found] == [Level.AMBER if is_coarse else Level.GREEN]
+    assert not any("repeats its last position" in str(each) for each in found)
+
+
 def test_a_receiver_that_holds_its_place_while_the_vehicle_stands_is_not_frozen() -> None:
     standing = drive(4, 120.0, ImuNoise())
     fixes = fixes_of(standing)

@@ -1,0 +1,263 @@
+"""How a table of text is written: encoding, comment lines, separators, and the names and units of its columns.
+
+One list of names and one of units serve all readers of tables. Of a name only letters and digits count. Its unit is in
+brackets behind it, at its end, or in a line below the names.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from factor_graphs.errors import MeasurementError
+
+HEADER_BYTES, HEADER_LINES = 100_000, 100
+MOST_COLUMNS, LONGEST_NAME = 1000, 200
+SEPARATORS = ";\t|,"
+COMMENT = re.compile(r"^\s*(?:#|%|//)+\s*")
+BRACKETS = re.compile(r"^(.*?)\s*[\[(<{]\s*([^\])>}]*)[\])>}]?\s*$")
+NUMBER_CELL = re.compile(r"^\s*[+-]?(nan|inf|[0-9]*[.,]?[0-9]+[.,]?(e[+-]?[0-9]+)?)\s*$", re.IGNORECASE)
+SPELLED = str.maketrans({"²": "2", "µ": "u", "μ": "u", "°": "deg"})
+DECIMAL_COMMA = re.compile(r"^\s*[+-]?[0-9]*,[0-9]+\s*$")
+
+DECIMAL_POINT = re.compile(r"^\s*[+-]?[0-9]*\.[0-9]+\s*$")
+
+_SCALES: dict[str, dict[float, str]] = {
+    "time": {
+        1.0: "s sec secs second seconds hms", 1e-3: "ms msec msecs millis milliseconds",
+        1e-6: "us usec usecs micros microseconds", 1e-9: "ns nsec nsecs nanos nanoseconds",
+    },
+    "angle": {1.0: "deg degs degree degrees dms", 180 / np.pi: "rad radian radians"},
+    "length": {
+        1.0: "m meter meters metre metres 68%", 1e-3: "mm", 1e-2: "cm", 0.3048: "ft feet", 1200 / 3937: "usft ftus",
+        1 / 1.96: "95%",
+    },
+    "force": {1.0: "ms2 mps2 mss msecsec", 9.80665: "g gs", 9.80665e-3: "mg"},
+    "rate": {1.0: "rads radps radsec", np.pi / 180: "degs dps degps degsec", np.pi / 180e3: "mdps"},
+    "speed": {1.0: "ms mps msec", 1 / 3.6: "kmh kph kmph", 1609.344 / 3600: "mph", 1852 / 3600: "kn kt kts knots"},
+}  # fmt: skip
+UNITS = {
+    kind: {word: scale for scale, words in scales.items() for word in words.split()}
+    for kind, scales in _SCALES.items()
+}
+"""By kind: unit -> what a number of it is multiplied by."""
+_FORCE = "a acc accel accelerometer acceleration linearacceleration specificforce force"
+_RATE = "w g gyr gyro gyroscope omega angularvelocity angularrate rotationrate rate"
+_NAMES: dict[str, dict[str, str]] = {
+    "time": {"stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc"},
+    "angle": {"lat_deg": "lat latitude gpslat", "lon_deg": "lon lng long longitude gpslon"},
+    "length": {
+        "alt_m": "alt hell ellipsoidheight ellipsoidalheight altitude height hgt h",
+        "msl_m": "msl hmsl altmsl altitudemsl heightmsl orthometricheight elevation ele",
+        "separation_m": "separation geoidseparation geoidsep geoidheight undulation",
+        "std_e_m": "stde sde sdeast eastsd stdeast sigmae sigmaeast eaststd eaststddev sdlon stdlon",
+        "std_n_m": "stdn sdn sdnorth northsd stdnorth sigman sigmanorth northstd northstddev sdlat stdlat",
+        "std_u_m": "stdu sdu sdup upsd sdheight heightsd stdup sigmau sigmaup upstd upstddev sdhgt stdalt vacc",
+        "x_m": "xecef ecefx", "y_m": "yecef ecefy", "z_m": "zecef ecefz", "easting_m": "easting",
+        "northing_m": "northing", "height_m": "",
+    },
+    "force": {f"a{x}": " ".join(f"{n}{x}" for n in _FORCE.split()) for x in "xyz"},
+    "rate": {f"w{x}": " ".join(f"{n}{x}" for n in _RATE.split()) for x in "xyz"},
+    "speed": {
+        "speed_mps": "speed velocity vel v wheelspeed vehiclespeed", "ve_mps": "ve", "vn_mps": "vn", "vu_mps": "vu",
+        "std_ve_mps": "stdve", "std_vn_mps": "stdvn", "std_vu_mps": "stdvu",
+    },
+    "none": {
+        "number": "number frame index frameid framenumber seq no id", "name": "name point pointname pointid id",
+        "type": "type", "epsg": "epsg", "heading_deg": "headingdeg", "std_heading_deg": "stdheadingdeg",
+        "corr_en": "corren", "corr_eu": "correu", "corr_nu": "corrnu",
+        "week": "week gpsweek weekno", "sow": "gpstime corrtime sow tow gpstow gpssow",
+        "date": "date utcdate gpsdate yearmmdd", "clock": "hrmnssss hrmnsssss utctime utc time timeutc",
+        "lat_d": "latdd", "lat_min": "latmn", "lat_s": "latss", "lon_d": "londd", "lon_min": "lonmn", "lon_s": "lonss",
+    },
+}  # fmt: skip
+NAMES = {name: words.split() for names in _NAMES.values() for name, words in names.items()}
+"""Name of a column -> what others call it; of several that are there, the first of this list is taken."""
+KINDS = {name: kind for kind, names in _NAMES.items() for name in names}
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a column is in its table, and what its numbers are multiplied by; `unit`: the table tells its unit."""
+
+    at: int
+    scale: float = 1.0
+    unit: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """How a table is written: `rows` are UTF-8, without comment lines, from the line before the first row on."""
+
+    header: list[str]
+    rows: memoryview
+    separator: str = ","
+    decimal: str = "."
+
+    @cached_property
+    def _plain(self) -> list[tuple[str, str | None]]:
+        """Name and unit of each column, if it tells one."""
+        cells = [BRACKETS.match(text[:LONGEST_NAME]) for text in self.header]
+        return [
+            (_letters(text), None) if cell is None else (_letters(cell[1]), _letters(cell[2]))
+            for text, cell in zip(self.header, cells, strict=True)
+        ]
+
+    def column(self, name: str) -> Column | None:
+        """The column of a name of `NAMES`; raises MeasurementError where there are two, or its unit is unknown."""
+        found = [Column(k, unit=True) for k, text in enumerate(self.header) if text == name]
+        for word in NAMES.get(name, []):
+            found = found or list(self._called(word, name))
+        if len(found) > 1:
+            raise MeasurementError(f"column {name} is missing or repeated in {self.shown}")
+        return found[0] if found else None
+
+    def _called(self, word: str, name: str) -> Iterator[Column]:
+        units = UNITS.get(KINDS[name], {})
+        for k, (plain, unit) in enumerate(self._plain):
+            is_other = self.header[k] in NAMES
+            at_end = plain[len(word) :] if plain.startswith(word) and not is_other else None
+            if at_end == "" and unit in (None, ""):
+                yield Column(k)
+            elif at_end == "" and (unit in units or not units):
+                yield Column(k, units.get(str(unit), 1.0), True)
+            elif at_end == "":
+                raise MeasurementError(
+                    f"column {self.header[k][:50]!r} is in a unit that is not known; expected one of"
+                    f" {', '.join(units)}; without one, it is in the first"
+                )
+            elif at_end in units:
+                yield Column(k, units[at_end], True)
+
+    @property
+    def shown(self) -> str:
+        """The header for messages."""
+        return " ".join(",".join(self.header).split())[:200]
+
+
+def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = ()) -> Layout:
+    """How a table is written that has `wanted` columns, and perhaps some of `most`; of another, by its first line."""
+    content = _utf8(content)
+    lines = _decoded(content[:HEADER_BYTES]).split("\n")[:HEADER_LINES]
+    at = _header_line(lines, wanted, most)
+    header, header_separator = _split(COMMENT.sub("", lines[at]))
+    rest = [k for k in range(at + 1, len(lines)) if lines[k].strip() and not COMMENT.match(lines[k])]
+    if rest and _are_units(lines[rest[0]]):
+        header, at, rest = _with_units(lines[at], header, lines[rest[0]]), rest[0], rest[1:]
+    separator, is_ended = _separator([lines[k] for k in rest], len(header), header_separator)
+    cells = [cell for k in rest for cell in _cells(lines[k], separator)]
+    has_commas = any(map(DECIMAL_COMMA.match, cells)) and not any(map(DECIMAL_POINT.match, cells))
+    decimal = "," if separator != "," and has_commas else "."
+    rows = memoryview(content)[_end_of_line(content, at - 1) :]
+    if any(b"\n" + mark in content for mark in (b"#", b"%", b"//", b" #", b"\t#")):
+        rows = memoryview(re.sub(rb"(?<=\n)[ \t]*(?:#|%|//).*\n?", b"", rows))
+    if separator == " ":
+        by_tabs = b"\n".join(b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
+        rows, separator = memoryview(by_tabs), "\t"
+    return Layout([*header, ""] if is_ended else header, rows, separator, decimal)
+
+
+def _utf8(content: bytes) -> bytes:
+    """UTF-16, which other programs write, as UTF-8; lines of old ones end in line feeds."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        content = content.decode("utf-16", "replace").encode()
+    elif content[1:2] == b"\0" or content[:1] == b"\0":
+        content = content.decode("utf-16-le" if content[1:2] == b"\0" else "utf-16-be", "replace").encode()
+    return content if b"\n" in content or b"\r" not in content else content.replace(b"\r", b"\n")
+
+
+def _decoded(head: bytes) -> str:
+    try:
+        return head.rpartition(b"\n")[0].decode("utf-8-sig") if b"\n" in head else head.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return head.decode("cp1252", "replace")  # of Windows, with its degree sign
+
+
+def _header_line(lines: list[str], wanted: Collection[str], most: Collection[str]) -> int:
+    """The line that has most of the names; else the first that is none of a comment."""
+    scores = []
+    for line in lines:
+        layout = Layout(_split(COMMENT.sub("", line))[0], memoryview(b""))
+        scores.append(sum(_has(layout, n) for n in wanted) + 1e-3 * sum(_has(layout, n) for n in most))
+        if scores[-1] >= len(wanted) > 0:
+            return len(scores) - 1
+    if max(scores) >= 1:
+        return int(np.argmax(scores))
+    return next((k for k, line in enumerate(lines) if line.strip() and not COMMENT.match(line)), 0)
+
+
+def _has(layout: Layout, name: str) -> bool:
+    try:
+        return layout.column(name) is not None
+    except MeasurementError:
+        return True
+
+
+def _split(line: str) -> tuple[list[str], str]:
+    """The cells of a line that may be of names, and what separates them."""
+    separator = next((mark for mark in SEPARATORS if mark in line.strip()), " ")
+    return [cell.strip().strip('"') for cell in _cells(line, separator)[:MOST_COLUMNS]], separator
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    try:
+        return next(csv.reader([line.rstrip("\r\n")], delimiter=separator), [])
+    except csv.Error:
+        return line.split(separator)
+
+
+def _separator(rows: list[str], columns: int, of_header: str) -> tuple[str, bool]:
+    """What separates the cells of rows, by the first; and whether it ends them, too."""
+    row = rows[0] if rows else of_header
+    for separator in (of_header, *SEPARATORS, " "):
+        cells = _cells(row, separator)
+        if len(cells) == columns:
+            return separator, False
+        if len(cells) == columns + 1 and not cells[-1].strip():
+            return separator, True
+    return (of_header if of_header in row else " "), False
+
+
+def _are_units(line: str) -> bool:
+    """Whether a line below the names tells their units."""
+    cells = _split(line)[0]
+    known = {unit for units in UNITS.values() for unit in units}
+    if any(map(NUMBER_CELL.match, cells)):
+        return False
+    return line.lstrip()[:1] in ("(", "[") or any(_letters(cell) in known for cell in cells)
+
+
+def _with_units(names: str, header: list[str], below: str) -> list[str]:
+    """The names with the units that stand below them: as many, or where they end."""
+    words = re.findall(r"[\[(][^\])]*[\])]", below)
+    units = _split(below)[0] if len(_split(below)[0]) == len(header) else words
+    if len(units) != len(header):
+        ends = np.array([m.end() for m in re.finditer(r"\S+", names)])
+        if len(ends) != len(header):
+            return header
+        there = {int(np.abs(ends - m.end()).argmin()): m[0] for m in re.finditer(r"[\[(][^\])]*[\])]", below)}
+        units = [there.get(k, "") for k in range(len(header))]
+    return [f"{name} [{unit.strip('[]()')}]" for name, unit in zip(header, units, strict=True)]
+
+
+def _letters(text: str) -> str:
+    """Letters, digits and percent signs of a name or a unit, in lower case; units are spelled out."""
+    text = text.strip().strip('"').lower().translate(SPELLED)
+    return re.sub("[^a-z0-9%]", "", text.removeprefix("field."))
+
+
+def _end_of_line(content: bytes, line: int) -> int:
+    """Where a line ends, from 0."""
+    at = -1
+    for _ in range(line + 1):
+        at = content.find(b"\n", at + 1)
+        if at < 0:
+            return len(content)
+    return at + 1

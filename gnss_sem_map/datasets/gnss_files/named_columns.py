@@ -1,0 +1,245 @@
+"""Positions in a table with named columns: exports of Inertial Explorer and POSPac, CSRS-PPP, a CSV of one's own.
+
+Names and units are those of `factor_graphs.tables`. Times are a GPS week and its seconds, a date and a time of day or
+of the week, ISO 8601, or Unix time; or times of a week or a day alone, then of the one nearest to the drive. Latitude
+and longitude are degrees, or degrees, minutes and seconds, in one column or three; or positions are geocentric.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.table_dates import DATE, seconds_of_dates, unix_scale
+from factor_graphs.tables import Column, Layout, layout_of
+from gnss_sem_map.datasets.gnss_files.positions import Positions, geodetic_of_ecef, thinned
+from gnss_sem_map.datasets.gnss_files.sbet import over_weeks
+from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, GPS_EPOCH_NS, WEEK_NS, nearest
+from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import MOST_LINES, MOST_TEXT_BYTES, read_bytes, shown
+from gnss_sem_map.sensor_log import Skip
+
+Array = NDArray[np.float64]
+System = Literal["utc", "gps"]
+
+ANGLES = ("lat_deg", "lon_deg")
+PARTS = {"lat_deg": ("lat_d", "lat_min", "lat_s"), "lon_deg": ("lon_d", "lon_min", "lon_s")}
+GEOCENTRIC, STDDEVS = ("x_m", "y_m", "z_m"), ("std_e_m", "std_n_m", "std_u_m")
+NAMED = (
+    *ANGLES, *PARTS["lat_deg"], *PARTS["lon_deg"], *GEOCENTRIC, *STDDEVS, "alt_m", "msl_m", "separation_m",
+    "week", "sow", "date", "clock", "stamp_s",
+)  # fmt: skip
+EXPECTED = (
+    "expected RTKLIB, NMEA, or columns of time, latitude, longitude and height, such as Week GPSTime Latitude Longitude"
+    " H-Ell"
+)
+DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
+LARGEST, LATEST_S = 1e19, (LAST_YEAR - 1970) * 366 * DAY_S
+"""No number of a table is larger, and no time of a drive is later."""
+MONTHS_FIRST = (2, 0, 1)
+"""Month, day, year, as Inertial Explorer has a date that does not begin with the year."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Lines of rows, and the columns that were found."""
+
+    layout: Layout
+    columns: dict[str, Column]
+    lines: list[str]
+    are_angles_split: bool
+    """Degrees, minutes and seconds are cells of their own, though the header has one name for them."""
+
+    def has(self, *names: str) -> bool:
+        """Whether all of these columns are there."""
+        return all(name in self.columns for name in names)
+
+    def texts(self, name: str) -> list[str]:
+        """The cells of a column; those of an angle joined by spaces."""
+        at, count = self.columns[name].at, 1
+        if self.are_angles_split:
+            at += 2 * sum(self.columns[angle].at < at for angle in ANGLES)
+            count = 3 if name in ANGLES else 1
+        rows = (line.split(self.layout.separator) for line in self.lines)
+        return [" ".join(row[at : at + count]).strip().strip('"') for row in rows]
+
+    def numbers(self, name: str) -> Array:
+        """Numbers of a column in our units; NaN for what is none."""
+        return np.array([_number(text) for text in self.texts(name)]) * self.columns[name].scale
+
+
+def read(path: Path, near_ns: int | None, has_stddevs: bool) -> Positions:
+    """Positions of a table, at most ten a second; raises DataError where it is none, or tells no accuracy."""
+    table = _opened(path)
+    moments, system = _moments(table, near_ns, path)
+    count, usable = len(moments), np.abs(moments) < LATEST_S
+    rows = np.flatnonzero(usable)
+    if len(rows) and (np.diff(moments[rows]) > 0).all():
+        rows = rows[thinned(moments[rows])]
+    lost, moments = count - int(usable.sum()), moments[rows]
+    table = _Table(
+        table.layout, table.columns, [table.lines[k] for k in rows.tolist()], table.are_angles_split
+    )
+    if not table.has(*STDDEVS) and not has_stddevs:
+        raise DataError(
+            f"{shown(path)}: {table.layout.shown} does not tell its accuracy; set `stddevs_m: [east, north, up]`"
+        )
+    places, above_geoid = _places(table, path)
+    stddevs = np.column_stack(
+        [table.numbers(name) if table.has(*STDDEVS) else np.ones(len(rows)) for name in STDDEVS]
+    )
+    known = np.isfinite(places).all(axis=1) & np.isfinite(stddevs).all(axis=1)
+    if not known.any():
+        raise DataError(
+            f"{shown(path)}: found no position among {count} rows of {table.layout.shown}; {EXPECTED}"
+        )
+    lost += int((~known).sum())
+    skips = [Skip("fix", shown(path), f"{lost} rows without a time or a place", lost)] if lost else []
+    stamps = np.round(moments[known] * 1e9).astype(np.int64)
+    return Positions(
+        stamps, places[known], stddevs[known], system, skips, above_geoid=np.full(len(stamps), above_geoid)
+    )
+
+
+def _opened(path: Path) -> _Table:
+    content = read_bytes(path, MOST_TEXT_BYTES)
+    try:
+        layout = layout_of(content, NAMED)
+        found = {name: layout.column(name) for name in NAMED}
+    except MeasurementError as error:
+        raise DataError(f"{shown(path)}: {error}") from None
+    lines = bytes(layout.rows).decode("utf-8", "replace").split("\n")[1:]
+    lines = [line for line in lines if line.strip()]
+    if len(lines) > MOST_LINES:
+        raise DataError(f"{shown(path)}: found {len(lines)} lines, expected at most {MOST_LINES}")
+    columns = {name: column for name, column in found.items() if column is not None}
+    if not lines or not ({"lat_deg", "lat_d", "x_m"} & columns.keys()):
+        raise DataError(f"{shown(path)}: found {layout.shown or 'nothing'}; {EXPECTED}")
+    if layout.decimal == ",":
+        lines = [line.replace(",", ".") for line in lines]
+    cells = len(lines[0].split(layout.separator))
+    return _Table(layout, columns, lines, cells == len(layout.header) + 4 and {*ANGLES} <= columns.keys())
+
+
+def _places(table: _Table, path: Path) -> tuple[Array, bool]:
+    """Latitude, longitude °, height m (n, 3), NaN for what is none; and whether heights are above the geoid."""
+    if table.has(*GEOCENTRIC) and not table.has("lat_deg"):
+        return geodetic_of_ecef(np.column_stack([table.numbers(name) for name in GEOCENTRIC])), False
+    angles = [_angles(table, name) for name in ANGLES if table.has(name) or table.has(*PARTS[name])]
+    if len(angles) < len(ANGLES) or not ({"alt_m", "msl_m"} & table.columns.keys()):
+        raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
+    if table.has("alt_m"):
+        return np.column_stack([*angles, table.numbers("alt_m")]), False
+    height = table.numbers("msl_m")
+    if table.has("separation_m"):
+        return np.column_stack([*angles, height + table.numbers("separation_m")]), False
+    return np.column_stack([*angles, height]), True
+
+
+def _angles(table: _Table, name: str) -> Array:
+    if table.has(name):
+        return np.array([_degrees(text) for text in table.texts(name)]) * table.columns[name].scale
+    parts = zip(*(table.texts(part) for part in PARTS[name]), strict=True)
+    return np.array([_degrees(" ".join(texts)) for texts in parts])
+
+
+def _moments(table: _Table, near_ns: int | None, path: Path) -> tuple[Array, System]:
+    """Times (n,), s since 1970 on their clock, NaN for what is none; and which clock it is."""
+    if table.has("week", "sow"):
+        return GPS_EPOCH_NS * 1e-9 + table.numbers("week") * WEEK_S + table.numbers("sow"), "gps"
+    name = next((name for name in ("sow", "clock", "stamp_s") if table.has(name)), None)
+    if name is None:
+        raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
+    texts = table.texts(name)
+    label = table.layout.header[table.columns[name].at].lower()
+    is_gps = name == "sow" or label.startswith(("gps", "hr"))  # CSRS-PPP has GPS time
+    if any(map(DATE.fullmatch, texts[:100])):
+        return seconds_of_dates(texts, 0), "gps" if is_gps else "utc"
+    clock = np.array([_clock(text) for text in texts])
+    if table.has("date"):
+        days = _days(table.texts("date"))
+        sundays = days - (days / DAY_S + 4) % 7 * DAY_S
+        return np.where(clock >= DAY_S, sundays, days) + clock, "gps" if is_gps else "utc"
+    column = table.columns[name]
+    clock = clock * (column.scale if column.unit else unix_scale(clock))
+    known = np.abs(clock) < LATEST_S
+    if not known.any() or np.median(clock[known]) > 2 * WEEK_S:
+        return clock, "utc"
+    return _nearest(clock, known, is_of_day=":" in texts[int(np.argmax(known))], near_ns=near_ns, path=path)
+
+
+def _nearest(
+    clock: Array, known: NDArray[np.bool_], is_of_day: bool, near_ns: int | None, path: Path
+) -> tuple[Array, System]:
+    """Times of a day of UTC, or of a GPS week, on the day or week nearest to a moment."""
+    if near_ns is None:
+        raise DataError(
+            f"{shown(path)}: tells neither date nor week, and no other sensor of this log does; add a column Week"
+        )
+    times, start, period = clock[known], GPS_EPOCH_NS, WEEK_NS
+    if is_of_day:
+        times, start, period = (
+            times + DAY_S * np.cumsum(np.diff(times, prepend=times[:1]) < -DAY_S / 2),
+            0,
+            DAY_NS,
+        )
+    else:
+        times = over_weeks(times)
+    moments = np.full(len(clock), np.nan)
+    moments[known] = nearest(start + np.round(times * 1e9).astype(np.int64), period, near_ns) * 1e-9
+    return moments, "utc" if is_of_day else "gps"
+
+
+def _days(texts: list[str]) -> Array:
+    """Dates (n,) as s since 1970; one that does not begin with its year begins with the month, unless none does."""
+    parts = [[int(word) for word in re.findall(r"\d{1,4}", text)][:3] for text in texts]
+    first = max((part[0] for part in parts if len(part) == 3), default=0)
+    order = (0, 1, 2) if first > 31 else MONTHS_FIRST if first <= 12 else (2, 1, 0)
+    return np.array([_day(part, order) for part in parts])
+
+
+def _day(part: list[int], order: tuple[int, int, int]) -> float:
+    if len(part) < 3 or not FIRST_YEAR <= part[order[0]] <= LAST_YEAR:
+        return float("nan")
+    year, month, day = (part[k] for k in order)
+    try:
+        return float(np.datetime64(f"{year:04d}-{month:02d}-{day:02d}", "s").astype(np.int64))
+    except ValueError:
+        return float("nan")
+
+
+def _clock(text: str) -> float:
+    """Hours, minutes and seconds, or a number, as s; NaN for what is neither."""
+    words = text.split(":")
+    if len(words) != 3:
+        return _number(text)
+    hours, minutes, seconds = map(_number, words)
+    return hours * 3600 + minutes * 60 + seconds
+
+
+def _degrees(text: str) -> float:
+    """A number, or degrees, minutes and seconds, with a sign or the letter of a hemisphere; NaN for what is neither."""
+    whole = _number(text)
+    if np.isfinite(whole):
+        return whole
+    numbers = [float(word) for word in re.findall(r"\d{1,9}(?:\.\d{0,15})?", text)]
+    if not 1 <= len(numbers) <= 3 or any(part >= 60 for part in numbers[1:]):
+        return float("nan")
+    size = sum(part / 60**k for k, part in enumerate(numbers))
+    is_below = text.lstrip().startswith("-") or text.strip().upper().endswith(("S", "W"))
+    return float(-size if is_below else size)
+
+
+def _number(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        return float("nan")
+    return number if abs(number) < LARGEST else float("nan")

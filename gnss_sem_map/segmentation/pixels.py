@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,12 @@ def checked_pixels(image: Image) -> NDArray[np.uint8]:
             " convert grey or 16-bit images first"
         )
     return pixels
+
+
+def named(images: Sequence[Image], pixels: NDArray[np.uint8]) -> str:
+    """The images of one size and that size, for messages: a network's errors depend on it."""
+    numbers = ", ".join(str(image.number) for image in images)
+    return f"image {numbers} of {pixels.shape[1]} x {pixels.shape[0]} pixels"
 
 
 def scaled(

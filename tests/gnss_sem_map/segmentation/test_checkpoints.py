@@ -205,7 +205,7 @@ def test_a_device_whose_memory_is_full_is_our_error() -> None:
     def full(*_: Any) -> Any:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
-    segment = NetworkSegmenter(full, ("road",), torch.device("cpu"), (0, 0, 0), (1, 1, 1))
+    segment = NetworkSegmenter("net", full, ("road",), torch.device("cpu"), torch.from_numpy)
     with pytest.raises(DataError, match="memory is full; try fewer images at once"):
         segment(camera())
 

@@ -20,7 +20,13 @@ from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.backbones import RESNET_BLOCKS
 from gnss_sem_map.segmentation.classes import VOID, named_classes
-from gnss_sem_map.segmentation.networks import NetworkSegmenter, find_device, for_inference, from_logits, normalised
+from gnss_sem_map.segmentation.networks import (
+    NetworkSegmenter,
+    find_device,
+    for_inference,
+    from_logits,
+    normalised,
+)
 from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 

@@ -34,7 +34,13 @@ from transformers.utils import cached_file, logging
 from gnss_sem_map.errors import DataError, one_line, program
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.classes import VOID, named_classes
-from gnss_sem_map.segmentation.networks import NetworkSegmenter, Prepare, Probabilities, find_device, from_logits
+from gnss_sem_map.segmentation.networks import (
+    NetworkSegmenter,
+    Prepare,
+    Probabilities,
+    find_device,
+    from_logits,
+)
 from gnss_sem_map.segmentation.pixels import scale_and_shrink
 
 MASK_NETWORKS = ("maskformer", "mask2former", "oneformer", "eomt", "eomt_dinov3")
@@ -219,7 +225,7 @@ def _task_tokens(model: str, config: Any) -> Tensor:
 
 
 def _prepare(model: str, config: Any) -> Prepare:
-    """The image processor of the model, but for its resizing: channel order, range, mean and standard deviation are its own."""
+    """The image processor of the model, but for its resizing: it knows the order of channels, their range and mean."""
     try:
         with _quiet():
             if any(cached_file(model, name, **LOCAL) for name in PROCESSOR_FILES):
@@ -233,7 +239,7 @@ def _prepare(model: str, config: Any) -> Prepare:
     except Exception as error:  # whatever a file of settings may make of others' code
         raise DataError(
             f"hf:{model}: its image processor, as preprocessor_config.json sets it, cannot be used: {one_line(error)}"
-        ) from None
+        ) from error
 
     def prepare(pixels: NDArray[np.uint8]) -> Tensor:
         seen = processor(list(pixels), return_tensors="pt", input_data_format="channels_last")

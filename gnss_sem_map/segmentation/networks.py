@@ -86,9 +86,7 @@ class NetworkSegmenter:
         except Exception as error:  # networks are others' code
             raise DataError(f"{where}: {type(error).__name__} {one_line(error)}") from error
         if not np.isfinite(result).all():
-            raise DataError(
-                f"{where}: the network's probabilities are not finite; are its weights damaged?"
-            )
+            raise DataError(f"{where}: the network's probabilities are not finite; are its weights damaged?")
         return [np.ascontiguousarray(one) for one in result]
 
     def _run(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:

@@ -23,10 +23,15 @@ from gnss_sem_map.evaluation.preflight.camera_pose import (
 from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.depth_edges import UNCHANGED, Change, Edges, View, border_strength
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import LabelImage
+from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
+from gnss_sem_map.segmentation.classes import unknown_classes
 
-NAME, PLACE = "labels", "labels against LiDAR"
+NAME, PLACE, NAMES = "labels", "labels against LiDAR", "class names"
+MOST_REFUSED = 0.5
+"""Of the label files looked at; with more of them refused, the map would miss most of its labels."""
 ONE_CLASS = 0.97
 """No camera of a road sees only one class, image after image."""
 LEAST_KNOWN = 0.01
@@ -42,21 +47,30 @@ def check(sample: CameraSample, against_lidar: bool) -> Iterator[Finding]:
         return
     views: list[View] = []
     seen: list[NDArray[np.int64]] = []
-    errors: list[DataError] = []
+    missing: list[DataError] = []
+    refused: list[DataError] = []
     for view, image in zip(edges.views, sample.edge_images, strict=True):
         try:
             classes = classes_of(segmenter.kept(image))
         except DataError as error:
-            errors.append(error)
+            (missing if isinstance(error, MissingLabels) else refused).append(error)
             continue
         seen.append(classes)
         coarse, fine = border_strength(classes, sample.camera.image_size)
         views.append(View(view.p_map, view.weights, view.stamp, coarse, fine))
-    if not seen and errors:
+    if refused:
+        count = len(seen) + len(refused)
+        yield (red if len(refused) > MOST_REFUSED * count else amber)(
+            NAME,
+            f"{len(refused)} of {count} label files looked at are refused, such as {refused[0]}",
+            "label files are damaged, of other images, or hold ids of another kind",
+            "make them again, or say what their ids are (labels:FOLDER?ids=...)",
+        )
+    elif not seen and missing:
         yield amber(
             NAME,
-            f"none of {len(errors)} frames looked at has labels that can be read: {errors[0]}",
-            "labels are of other frames, or damaged",
+            f"none of {len(missing)} frames looked at has labels: {missing[0]}",
+            "labels are of other frames",
             "check the frame numbers in the names of the label files",
         )
     if not seen:
@@ -65,6 +79,18 @@ def check(sample: CameraSample, against_lidar: bool) -> Iterator[Finding]:
     yield content
     if against_lidar and not content.mistake:
         yield _place(sample, replace(edges, views=tuple(views)))
+
+
+def check_names(segmenter: Segmenter | None, label_set: LabelSet) -> Iterator[Finding]:
+    """The class names of any segmenter: unknown ones are listed, in one finding."""
+    found = None if segmenter is None else unknown_classes(segmenter.class_names, label_set)
+    if found is not None:
+        yield amber(
+            NAMES,
+            found,
+            "the class set does not know them",
+            "name them with ?classes=..., or in the `sources` of the class set file",
+        )
 
 
 def classes_of(labels: NDArray[np.uint8] | NDArray[np.float32] | LabelImage) -> NDArray[np.int64]:

@@ -132,7 +132,19 @@ def maskformer() -> Any:
     return transformers.MaskFormerForInstanceSegmentation(config)
 
 
-FAMILIES = (segformer, mobilevit, mobilenet, dpt, beit, data2vec, upernet, maskformer, mask2former, oneformer, eomt)
+FAMILIES = (
+    segformer,
+    mobilevit,
+    mobilenet,
+    dpt,
+    beit,
+    data2vec,
+    upernet,
+    maskformer,
+    mask2former,
+    oneformer,
+    eomt,
+)
 
 
 def save_tokenizer(folder: Path) -> None:
@@ -252,7 +264,9 @@ def captured(folder: Path, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch) 
     given: list[torch.Tensor] = []
     segment = open_segmenter(f"hf:{folder}?shrink=1", URBAN, device="cpu")
     see = segment._probabilities  # type: ignore[attr-defined]
-    monkeypatch.setattr(segment, "_probabilities", lambda images, size: (given.append(images), see(images, size))[1])
+    monkeypatch.setattr(
+        segment, "_probabilities", lambda images, size: (given.append(images), see(images, size))[1]
+    )
     segment(camera(pixels))
     return given[0]
 
@@ -272,7 +286,9 @@ def test_every_family_sees_what_its_own_image_processor_makes_of_an_image_of_its
 ) -> None:
     model = saved(tmp_path, build())
     about = processor_of(model.config)
-    by_edges = {"shortest_edge": 64, "longest_edge": 96} if "Former" in about.__name__ else {"shortest_edge": 64}
+    by_edges = (
+        {"shortest_edge": 64, "longest_edge": 96} if "Former" in about.__name__ else {"shortest_edge": 64}
+    )
     size = {"height": 64, "width": 96} if "height" in dict(about.size) else by_edges
     extra = {"task_inputs": ["semantic"]} if build is oneformer else {}
     for settings in SETTINGS:
@@ -310,10 +326,16 @@ def test_every_family_gives_probabilities_of_images_of_any_shape(
 
 
 @pytest.mark.parametrize("build", [dpt, beit, data2vec])
-def test_logits_of_a_network_of_squares_are_averaged_where_windows_overlap(tmp_path: Path, build: Any) -> None:
+def test_logits_of_a_network_of_squares_are_averaged_where_windows_overlap(
+    tmp_path: Path, build: Any
+) -> None:
     model = saved(tmp_path, build())
     processor_of(model.config)(image_mean=[0.5, 0.4, 0.3], image_std=[0.3] * 3).save_pretrained(tmp_path)
-    image, total, count = normalised((0.5, 0.4, 0.3), (0.3, 0.3, 0.3)), torch.zeros(6, 64, 96), torch.zeros(96)
+    image, total, count = (
+        normalised((0.5, 0.4, 0.3), (0.3, 0.3, 0.3)),
+        torch.zeros(6, 64, 96),
+        torch.zeros(96),
+    )
     with torch.inference_mode():
         for left in (0, 32):
             logits = interpolate(model(image[..., left : left + 64]).logits, (64, 64), mode="bilinear")
@@ -324,7 +346,9 @@ def test_logits_of_a_network_of_squares_are_averaged_where_windows_overlap(tmp_p
     np.testing.assert_allclose(seen, expected.permute(1, 2, 0), atol=1e-5)
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"image_mean": "red"}', '{"image_processor_type": "Oven"}', "\0"])
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"image_mean": "red"}', '{"image_processor_type": "Oven"}', "\0"]
+)
 def test_a_damaged_image_processor_is_our_error_on_opening(tmp_path: Path, content: str) -> None:
     saved(tmp_path, segformer())
     (tmp_path / "preprocessor_config.json").write_text(content)
@@ -337,7 +361,9 @@ def test_an_error_inside_a_network_names_network_image_and_shape(tmp_path: Path)
     saved(tmp_path, segformer())
     segment = open_segmenter(f"hf:{tmp_path}", URBAN, device="cpu")
     segment._probabilities = lambda images, size: torch.zeros(3) @ images  # type: ignore[attr-defined]
-    with pytest.raises(DataError, match=rf"hf:{tmp_path} on image 0 of 96 x 64 pixels: RuntimeError") as caught:
+    with pytest.raises(
+        DataError, match=rf"hf:{tmp_path} on image 0 of 96 x 64 pixels: RuntimeError"
+    ) as caught:
         segment(camera())
     assert "\n" not in str(caught.value)
 

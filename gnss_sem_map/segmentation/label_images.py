@@ -1,0 +1,214 @@
+"""Label images of any data set: names, colours and ids of the whole folder show what their values mean."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import ConfigError, DataError, counted
+from gnss_sem_map.files.pictures import LabelPixels, read_labels
+from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, Taxonomy, shipped_taxonomies, taxonomy
+
+USUAL = "cityscapes"
+COLOUR = "colour"
+MARKS = {"labelTrainIds": "train_id", "labelIds": "label_id", "color": COLOUR, "instanceIds": "label_id"}
+"""What the names of Cityscapes' files say, and so those of tools that follow it; the best one first."""
+
+VOID, UNKNOWN = 255, 254
+"""Codes of pixels without a class, and of values that nobody knows; other codes are columns of the evidence."""
+ENOUGH = 0.1
+"""Ids that fit two kinds are of the one that gives so much more of the pixels a class of the map."""
+LOOKED_AT = 1 << 18
+"""Pixels of an image that are looked at to find out what the values mean."""
+HARD_LABEL_PROBABILITY = 0.9
+"""Probability of the class of a label image; the rest is spread evenly over the other classes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Meaning:
+    """What the values of the label images of a folder mean."""
+
+    source: Taxonomy
+    kind: str
+    codes: NDArray[np.uint8]
+    """Of every id (65536,) or colour (2^24,): the column of a class, VOID or UNKNOWN."""
+    base: int = 1
+    """Larger values of 16 bits are the id times this, and the number of an instance."""
+
+    def read(self, path: Path) -> NDArray[np.uint8]:
+        """The code of every pixel (h, w); raises DataError for a damaged file and for values that nobody knows."""
+        import cv2
+
+        values = self.values(read_labels(path), shown(path))
+        if values.dtype == np.uint8:
+            seen = np.asarray(cv2.LUT(values, self.codes[:256]), np.uint8)  # many times faster than indexing
+        else:
+            seen = np.take(self.codes, values)
+        unknown = np.unique(values[seen == UNKNOWN]).tolist()
+        if unknown and self.kind == COLOUR:
+            some = [(value >> 16, value >> 8 & 255, value & 255) for value in unknown[:5]]
+            raise DataError(
+                f"{shown(path)}: found {counted(len(unknown), 'colour')} such as {some}, which are none of"
+                f" {self.source.name}; expected one colour for each class, without blending: name their data set with"
+                " ?taxonomy="
+            )
+        if unknown:
+            raise DataError(
+                f"{shown(path)}: found ids {unknown[:20]}, which are no {self.kind} of {self.source.name}; name their"
+                " kind with ?ids=, or their data set with ?taxonomy="
+            )
+        return seen
+
+    def values(
+        self, pixels: LabelPixels, where: str
+    ) -> NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.int32]:
+        """The values of this kind, (h, w); raises DataError where the file has the others only."""
+        values = pixels.colours if self.kind == COLOUR else pixels.ids
+        if values is None:
+            found, expected = ("ids", "colours") if self.kind == COLOUR else ("colours", f"{self.kind} ids")
+            raise DataError(f"{where}: found {found}, expected {expected}, as ?ids= or the other files say")
+        if values.dtype != np.uint16:
+            return values
+        values = np.where(values == 0xFFFF, np.uint16(255), values)  # -1: without a class
+        if self.base == 1000:  # of Cityscapes only things have a number
+            return np.where(values < 1000, values, values // np.uint16(1000))
+        return values // np.uint16(self.base)
+
+
+def meaning_of(
+    files: Sequence[Path], label_set: LabelSet, name: str | None, kind: str | None, asked: str
+) -> Meaning:
+    """What label images mean: `kind` of taxonomy `name`, or what fits most of the files, colours before ids.
+
+    Ids that fit several kinds are of the one that explains the pixels far better; ConfigError (`asked` is the folder,
+    in words) where none does. DataError when no file can be read.
+    """
+    pictures, refused = list[LabelPixels](), list[DataError]()
+    for path in files:
+        try:
+            pictures.append(read_labels(path).some(LOOKED_AT))
+        except DataError as error:
+            refused.append(error)
+    if not pictures:
+        raise none_usable(refused)
+    readings = list(_readings(pictures, label_set, name, kind))
+    explained = [[_explained(reading, one, len(label_set.names)) for one in pictures] for reading in readings]
+    fits = [sum(share is not None for share in shares) for shares in explained]
+    best = [i for i, count in enumerate(fits) if count == max(fits)]
+    if readings[best[0]].kind == COLOUR or len(best) == 1:
+        return readings[best[0]]
+    means = {i: float(np.mean([share for share in explained[i] if share is not None] or [0.0])) for i in best}
+    first, second, *_ = sorted(best, key=lambda i: -means[i])
+    if means[first] - means[second] >= ENOUGH:
+        return readings[first]
+    used = {int(v) for one in pictures for v in np.unique(readings[first].values(one, asked))}
+    if not means[first] or all(readings[first].codes[v] == readings[second].codes[v] for v in used):
+        return readings[best[0]]  # they say the same of the map's classes
+    kinds = [readings[i].kind for i in best]
+    raise ConfigError(
+        f"{asked}: its ids {sorted(used)[:20]} fit {' as well as '.join(kinds)} of {readings[first].source.name}; say"
+        f" which they are with {' or '.join(f'?ids={one}' for one in kinds)}"
+    )
+
+
+def none_usable(refused: Sequence[DataError]) -> DataError:
+    """The error for a folder of which every file that was tried is refused."""
+    more = f"; none of {len(refused)} label files that were tried can be used" if len(refused) > 1 else ""
+    return DataError(f"{refused[0]}{more}")
+
+
+def evidence_of_classes(label_set: LabelSet) -> NDArray[np.uint8]:
+    """Of every code (256, c + 1): its class gets HARD_LABEL_PROBABILITY, the others share the rest, void has none."""
+    count = len(label_set.names) + 1
+    rest = (1 - HARD_LABEL_PROBABILITY) / (count - 1)
+    evidence = np.zeros((256, count), np.uint8)
+    evidence[:count] = np.rint(255 * np.where(np.eye(count, dtype=bool), HARD_LABEL_PROBABILITY, rest))
+    return evidence
+
+
+def _readings(
+    pictures: Sequence[LabelPixels], label_set: LabelSet, name: str | None, kind: str | None
+) -> Iterator[Meaning]:
+    """All that the values may mean, colours first; raises ConfigError for a kind that there is not."""
+    usual = taxonomy(name or USUAL)
+    if kind is not None and kind not in usual.ids:
+        raise ConfigError(
+            f"labels: taxonomy {usual.name!r} has no ids {kind!r}; expected one of {list(usual.ids)}"
+        )
+    known = [
+        one for one in shipped_taxonomies() if name is None and one != USUAL and one in label_set.sources
+    ]
+    if kind == COLOUR or (kind is None and any(one.colours is not None for one in pictures)):
+        for source in (usual, *map(taxonomy, known)):
+            if COLOUR in source.ids:
+                yield Meaning(source, COLOUR, _codes(source, label_set, COLOUR, 1 << 24))
+    ids = [one.ids for one in pictures if one.ids is not None]
+    for one in usual.ids if kind is None else [kind] if kind != COLOUR else []:
+        if one != COLOUR and (ids or kind is not None):
+            largest = max(v for v in (*usual.ids[one].values(), *usual.void[one]) if v != VOID)
+            highest = max((int(v[v < 0xFFFF].max(initial=0)) for v in ids), default=0)
+            base = 1 if highest <= max(255, largest) else 256 if highest < 256 * (largest + 1) else 1000
+            yield Meaning(usual, one, _codes(usual, label_set, one, 1 << 16), base)
+
+
+def _codes(source: Taxonomy, label_set: LabelSet, kind: str, size: int) -> NDArray[np.uint8]:
+    classes = source.lookup(label_set, kind, size)
+    return np.where(classes >= 0, classes, np.where(classes == UNLABELLED, VOID, UNKNOWN)).astype(np.uint8)
+
+
+def _explained(reading: Meaning, pixels: LabelPixels, count: int) -> float | None:
+    """Share of the pixels that have one of the map's classes; None where some value is unknown."""
+    if (pixels.colours if reading.kind == COLOUR else pixels.ids) is None:
+        return None
+    seen = reading.codes[reading.values(pixels, "")]
+    return None if (seen == UNKNOWN).any() else float((seen < count).mean())
+
+
+def by_frame(paths: Iterable[Path], suffix: str, kind: str | None) -> tuple[dict[int, Path], str | None]:
+    """The files by frame number, and the kind of ids that their names tell; one name pattern of several is taken.
+
+    A name that is a number is one. Else it is the last number in it that differs between the files. Raises
+    DataError for two files of one frame, and for several patterns of which none is known.
+    """
+    patterns: dict[str, list[Path]] = {}
+    for path in paths:
+        if path.suffix.lower() == suffix and re.search(r"\d", path.stem):
+            patterns.setdefault(re.sub(r"\d+", "#", path.stem), []).append(path)
+    if "#" in patterns:  # beside it may lie pictures to look at
+        return _numbers(patterns["#"]), None
+    for mark, of in MARKS.items():
+        like = {pattern: files for pattern, files in patterns.items() if pattern.endswith(mark)}
+        if like and kind in (None, of):
+            return _numbers(_only(like)), of
+    return (_numbers(_only(patterns)), None) if patterns else ({}, None)
+
+
+def _only(patterns: dict[str, list[Path]]) -> list[Path]:
+    first, *others = patterns.values()
+    if others:
+        names = [shown(files[0].name) for files in (first, *others)][:3]
+        raise DataError(
+            f"labels {shown(first[0].parent)}: found files of several names, such as {names}; expected one kind: keep"
+            " them in two folders"
+        )
+    return first
+
+
+def _numbers(paths: list[Path]) -> dict[int, Path]:
+    columns = np.array([re.findall(r"\d+", path.stem) for path in paths], object).T
+    differ = [column for column in columns if len(set(column)) > 1]
+    chosen = differ[-1] if differ else max(columns, key=lambda column: len(column[0]))
+    files: dict[int, Path] = {}
+    for path, text in zip(paths, chosen, strict=True):
+        if int(text) in files:
+            raise DataError(
+                f"{shown(path)}: same frame as {shown(files[int(text)].name)}; expected one file per frame"
+            )
+        files[int(text)] = path
+    return files

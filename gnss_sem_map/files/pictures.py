@@ -93,7 +93,7 @@ def read_labels(path: Path) -> LabelPixels:
             # Pillow spreads grey values of less than 8 bits over 0 to 255, but for those of one bit
             step = 255 // (2**depth - 1) if depth > 1 else 1
             return LabelPixels(np.array(whole, np.uint8) // np.uint8(step), None)
-        red, green, blue = np.array(picture.convert("RGB"), np.int32).transpose(2, 0, 1)
+        red, green, blue, _ = np.array(picture.convert("RGBA"), np.int32).transpose(2, 0, 1)
         return LabelPixels(np.array(picture) if picture.mode == "P" else None, red << 16 | green << 8 | blue)
 
 

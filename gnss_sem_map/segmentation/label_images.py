@@ -159,7 +159,9 @@ def _readings(
 
 def _codes(source: Taxonomy, label_set: LabelSet, kind: str, size: int) -> NDArray[np.uint8]:
     classes = source.lookup(label_set, kind, size)
-    return np.where(classes >= 0, classes, np.where(classes == UNLABELLED, VOID, UNKNOWN)).astype(np.uint8)
+    codes = np.where(classes == UNLABELLED, np.uint8(VOID), np.uint8(UNKNOWN))
+    np.copyto(codes, classes, casting="unsafe", where=classes >= 0)
+    return codes
 
 
 def _explained(reading: Meaning, pixels: LabelPixels, count: int) -> float | None:

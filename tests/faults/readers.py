@@ -103,14 +103,21 @@ def picture(suffix: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     return Reader(file, lambda: read_image(file, None), mutate)
 
 
-def label_image(folder: Path) -> Reader:
-    """An image of class ids."""
-    import cv2
+def label_image(mode: str, folder: Path) -> Reader:
+    """An image of class ids of 8 (L) or 16 bits, by a palette (P), or of colours (RGB)."""
+    from PIL import Image
 
     from gnss_sem_map.segmentation.cached import CachedLabels
 
     folder.mkdir(parents=True)
-    cv2.imwrite(str(folder / "0.png"), np.random.default_rng(0).integers(0, 19, (96, 300), np.uint8))
+    ids = np.random.default_rng(0).integers(0, 4, (96, 300), np.uint8)
+    colours = np.array([(128, 64, 128), (244, 35, 232), (70, 70, 70), (102, 102, 156)], np.uint8)
+    picture = Image.fromarray(
+        colours[ids] if mode == "RGB" else ids.astype(np.uint16) if mode == "I;16" else ids
+    )
+    if mode == "P":
+        picture.putpalette(colours.ravel().tolist())
+    picture.save(folder / "0.png")
     return Reader(
         folder / "0.png", lambda: CachedLabels(folder, label_set.open_label_set(), None), mutations.png
     )
@@ -353,7 +360,10 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "scan of five columns": scan,
     "PNG": functools.partial(picture, ".png", mutations.png),
     "JPEG": functools.partial(picture, ".jpg", mutations.binary),
-    "label PNG": label_image,
+    "label PNG": functools.partial(label_image, "L"),
+    "label PNG of 16 bits": functools.partial(label_image, "I;16"),
+    "label PNG by a palette": functools.partial(label_image, "P"),
+    "label PNG of colours": functools.partial(label_image, "RGB"),
     "probabilities": probabilities,
     "point labels": point_labels,
     "TUM": tum,

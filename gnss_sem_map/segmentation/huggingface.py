@@ -41,7 +41,7 @@ from gnss_sem_map.segmentation.networks import (
     find_device,
     from_logits,
 )
-from gnss_sem_map.segmentation.pixels import scale_and_shrink
+from gnss_sem_map.segmentation.pixels import STRIDE, scale_and_shrink, whole_strides
 
 MASK_NETWORKS = ("maskformer", "mask2former", "oneformer", "eomt", "eomt_dinov3")
 """Mask networks; all others of the library for semantic segmentation give logits."""
@@ -57,9 +57,6 @@ AS_IT_IS = {
 """What an image processor is told: the map needs every pixel, undistorted, and nothing is fetched."""
 
 LOCAL = {"local_files_only": True, "_raise_exceptions_for_missing_entries": False}
-
-STRIDE = 32
-"""Of the coarsest features; images are stretched to whole multiples of it."""
 
 TASK = "the task is semantic"
 """Task prompt of OneFormer."""
@@ -204,7 +201,7 @@ def _starts(length: int, side: int) -> list[int]:
 
 def _stretched(probabilities: Probabilities) -> Probabilities:
     def run(images: Tensor, size: tuple[int, int]) -> Tensor:
-        whole = [max(STRIDE, STRIDE * round(side / STRIDE)) for side in images.shape[2:]]
+        whole = [whole_strides(side) for side in images.shape[2:]]
         return probabilities(interpolate(images, size=whole, mode="bilinear", align_corners=False), size)
 
     return run

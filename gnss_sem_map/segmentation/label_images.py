@@ -14,6 +14,7 @@ from gnss_sem_map.errors import ConfigError, DataError, counted
 from gnss_sem_map.files.pictures import LabelPixels, read_labels
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, Taxonomy, shipped_taxonomies, taxonomy
+from gnss_sem_map.labels.probabilities import of_hard_labels
 
 USUAL = "cityscapes"
 COLOUR = "colour"
@@ -26,8 +27,6 @@ ENOUGH = 0.1
 """Ids that fit two kinds are of the one that gives so much more of the pixels a class of the map."""
 LOOKED_AT = 1 << 18
 """Pixels of an image that are looked at to find out what the values mean."""
-HARD_LABEL_PROBABILITY = 0.9
-"""Probability of the class of a label image; the rest is spread evenly over the other classes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +125,8 @@ def none_usable(refused: Sequence[DataError]) -> DataError:
 def evidence_of_classes(label_set: LabelSet) -> NDArray[np.uint8]:
     """Of every code (256, c + 1): its class gets HARD_LABEL_PROBABILITY, the others share the rest, void has none."""
     count = len(label_set.names) + 1
-    rest = (1 - HARD_LABEL_PROBABILITY) / (count - 1)
     evidence = np.zeros((256, count), np.uint8)
-    evidence[:count] = np.rint(255 * np.where(np.eye(count, dtype=bool), HARD_LABEL_PROBABILITY, rest))
+    evidence[:count] = np.rint(255 * of_hard_labels(count))
     return evidence
 
 

@@ -76,7 +76,7 @@ def open_huggingface(
     as_scale, as_shrink = scale_and_shrink(scale, shrink, f"hf:{model}")
     config, network = _load(model)
     network.to(where).eval()
-    own = [config.id2label[i] for i in range(config.num_labels)]
+    own = [str(config.id2label.get(i, f"LABEL_{i}")) for i in range(config.num_labels)]
     names = named_classes(classes, config.num_labels, label_set, f"hf:{model}", own)
     masks = config.model_type in MASK_NETWORKS
     see = _masks(network, config, names, model, where) if masks else _logits(network, names)

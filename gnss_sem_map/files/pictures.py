@@ -97,15 +97,6 @@ def read_labels(path: Path) -> LabelPixels:
         return LabelPixels(np.array(picture) if picture.mode == "P" else None, red << 16 | green << 8 | blue)
 
 
-def read_ids(path: Path) -> NDArray[np.uint8]:
-    """The ids (h, w) of a PNG of 8 bits; raises DataError for anything else."""
-    ids = read_labels(path).ids
-    if ids is None or ids.dtype != np.uint8:
-        found = "colours" if ids is None else "16 bits"
-        raise DataError(f"{shown(path)}: found {found}, expected an 8-bit PNG of class ids, not colours")
-    return np.asarray(ids, np.uint8)
-
-
 @contextmanager
 def _opened(where: str, content: bytes) -> Iterator[ImageFile.ImageFile]:
     """Open a picture with a valid header and valid checksums; raises DataError, also while it is decoded."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError, counted
+from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.pictures import LabelPixels, read_labels
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, Taxonomy, shipped_taxonomies, taxonomy
@@ -50,17 +50,11 @@ class Meaning:
         else:
             seen = np.take(self.codes, values)
         unknown = np.unique(values[seen == UNKNOWN]).tolist()
-        if unknown and self.kind == COLOUR:
-            some = [(value >> 16, value >> 8 & 255, value & 255) for value in unknown[:5]]
-            raise DataError(
-                f"{shown(path)}: found {counted(len(unknown), 'colour')} such as {some}, which are none of"
-                f" {self.source.name}; expected one colour for each class, without blending: name their data set with"
-                " ?taxonomy="
-            )
         if unknown:
+            found = [f"#{v:06x}" for v in unknown[:5]] if self.kind == COLOUR else f"ids {unknown[:20]}"
             raise DataError(
-                f"{shown(path)}: found ids {unknown[:20]}, which are no {self.kind} of {self.source.name}; name their"
-                " kind with ?ids=, or their data set with ?taxonomy="
+                f"{shown(path)}: found {found}, which are no {self.kind} of {self.source.name}; say what they are"
+                " (?ids=, ?taxonomy=; train --ids, --taxonomy)"
             )
         return seen
 
@@ -71,7 +65,7 @@ class Meaning:
         values = pixels.colours if self.kind == COLOUR else pixels.ids
         if values is None:
             found, expected = ("ids", "colours") if self.kind == COLOUR else ("colours", f"{self.kind} ids")
-            raise DataError(f"{where}: found {found}, expected {expected}, as ?ids= or the other files say")
+            raise DataError(f"{where}: found {found}, expected {expected}, not {found}")
         if values.dtype != np.uint16:
             return values
         values = np.where(values == 0xFFFF, np.uint16(255), values)  # -1: without a class
@@ -100,19 +94,17 @@ def meaning_of(
     explained = [[_explained(reading, one, len(label_set.names)) for one in pictures] for reading in readings]
     fits = [sum(share is not None for share in shares) for shares in explained]
     best = [i for i, count in enumerate(fits) if count == max(fits)]
-    if readings[best[0]].kind == COLOUR or len(best) == 1:
+    means = sorted(
+        ((sum(share or 0 for share in explained[i]) / len(pictures), -i) for i in best), reverse=True
+    )
+    if readings[best[0]].kind == COLOUR or means[0][0] == 0:
         return readings[best[0]]
-    means = {i: float(np.mean([share for share in explained[i] if share is not None] or [0.0])) for i in best}
-    first, second, *_ = sorted(best, key=lambda i: -means[i])
-    if means[first] - means[second] >= ENOUGH:
-        return readings[first]
-    used = {int(v) for one in pictures for v in np.unique(readings[first].values(one, asked))}
-    if not means[first] or all(readings[first].codes[v] == readings[second].codes[v] for v in used):
-        return readings[best[0]]  # they say the same of the map's classes
-    kinds = [readings[i].kind for i in best]
+    if len(best) == 1 or means[0][0] - means[1][0] >= ENOUGH:
+        return readings[-means[0][1]]
+    kinds, ids = [readings[i].kind for i in best], [one.ids for one in pictures if one.ids is not None]
     raise ConfigError(
-        f"{asked}: its ids {sorted(used)[:20]} fit {' as well as '.join(kinds)} of {readings[first].source.name}; say"
-        f" which they are with {' or '.join(f'?ids={one}' for one in kinds)}"
+        f"{asked}: its ids {np.unique(np.concatenate(ids))[:20].tolist()} fit {' as well as '.join(kinds)} of"
+        f" {readings[best[0]].source.name}; say which they are with {' or '.join(f'?ids={one}' for one in kinds)}"
     )
 
 
@@ -130,36 +122,34 @@ def evidence_of_classes(label_set: LabelSet) -> NDArray[np.uint8]:
     return evidence
 
 
+def reading(source: Taxonomy, label_set: LabelSet, kind: str, highest: int = 0) -> Meaning:
+    """What values up to `highest` mean that are `kind` of `source`; raises ConfigError where it has no such kind."""
+    if kind not in source.ids:
+        raise ConfigError(f"taxonomy {source.name!r} has no ids {kind!r}; expected one of {list(source.ids)}")
+    classes = source.lookup(label_set, kind, 1 << 24 if kind == COLOUR else 1 << 16)
+    codes = np.where(classes == UNLABELLED, np.uint8(VOID), np.uint8(UNKNOWN))
+    np.copyto(codes, classes, casting="unsafe", where=classes >= 0)
+    largest = max((v for v in (*source.ids[kind].values(), *source.void[kind]) if v != VOID), default=0)
+    base = 1 if highest <= max(VOID, largest) else 256 if highest < 256 * (largest + 1) else 1000
+    return Meaning(source, kind, codes, base)
+
+
 def _readings(
     pictures: Sequence[LabelPixels], label_set: LabelSet, name: str | None, kind: str | None
 ) -> Iterator[Meaning]:
-    """All that the values may mean, colours first; raises ConfigError for a kind that there is not."""
+    """All that the values may mean, colours first."""
     usual = taxonomy(name or USUAL)
-    if kind is not None and kind not in usual.ids:
-        raise ConfigError(
-            f"labels: taxonomy {usual.name!r} has no ids {kind!r}; expected one of {list(usual.ids)}"
-        )
     known = [
         one for one in shipped_taxonomies() if name is None and one != USUAL and one in label_set.sources
     ]
     if kind == COLOUR or (kind is None and any(one.colours is not None for one in pictures)):
         for source in (usual, *map(taxonomy, known)):
             if COLOUR in source.ids:
-                yield Meaning(source, COLOUR, _codes(source, label_set, COLOUR, 1 << 24))
-    ids = [one.ids for one in pictures if one.ids is not None]
-    for one in usual.ids if kind is None else [kind] if kind != COLOUR else []:
-        if one != COLOUR and (ids or kind is not None):
-            largest = max(v for v in (*usual.ids[one].values(), *usual.void[one]) if v != VOID)
-            highest = max((int(v[v < 0xFFFF].max(initial=0)) for v in ids), default=0)
-            base = 1 if highest <= max(255, largest) else 256 if highest < 256 * (largest + 1) else 1000
-            yield Meaning(usual, one, _codes(usual, label_set, one, 1 << 16), base)
-
-
-def _codes(source: Taxonomy, label_set: LabelSet, kind: str, size: int) -> NDArray[np.uint8]:
-    classes = source.lookup(label_set, kind, size)
-    codes = np.where(classes == UNLABELLED, np.uint8(VOID), np.uint8(UNKNOWN))
-    np.copyto(codes, classes, casting="unsafe", where=classes >= 0)
-    return codes
+                yield reading(source, label_set, COLOUR)
+    highest = [int(v.ids[v.ids < 0xFFFF].max(initial=0)) for v in pictures if v.ids is not None]
+    for one in usual.ids if kind is None else (kind,):
+        if one != COLOUR:
+            yield reading(usual, label_set, one, max(highest, default=0))
 
 
 def _explained(reading: Meaning, pixels: LabelPixels, count: int) -> float | None:

@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as state
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, one_line
 from gnss_sem_map.files.untrusted import is_file, open_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import of_hard_labels, resized_softmax
@@ -32,11 +31,6 @@ DTYPES = {
 }  # fmt: skip
 PROBE = (256, 512)
 """(height, width) of the grey image that a network of any size sees on opening."""
-
-ONNX_ERRORS = (
-    state.Fail, state.InvalidArgument, state.InvalidGraph, state.InvalidProtobuf, state.NoModel, state.NoSuchFile,
-    state.NotImplemented, state.RuntimeException,
-)  # fmt: skip
 
 
 class OnnxSegmenter:
@@ -75,7 +69,7 @@ class OnnxSegmenter:
             np.float32(255 / float(pixel_max)),
         )
         told = None if classes is None else named_classes(classes, None, label_set, str(path))
-        self._input, self._output, count = _probed(self._session, path, told)
+        self._input, self._output, self._axis, count = _probed(self._session, path, told)
         names = told or named_classes(None, count, label_set, str(path))
         if count not in (None, len(names)):
             raise ConfigError(
@@ -97,13 +91,13 @@ class OnnxSegmenter:
         if self._input.dtype != np.uint8:
             seen = (seen / self._unit - self._mean) / self._std
         try:
-            answer = self._session.run([self._output.name], self._input.feed(seen))[0]
+            answer = self._session.run([self._output], self._input.feed(seen))[0]
         except Exception as error:  # of any of its providers
-            raise DataError(f"{where}: {_first_line(error)}") from error
+            raise DataError(f"{where}: {one_line(error)}") from error
         if not np.isfinite(answer).all():
             raise DataError(f"{where}: logits are not finite; is the normalisation right?")
-        if self._output.axis is None:
-            ids = np.squeeze(answer[0] if answer.ndim > 2 else answer)
+        if self._axis is None:
+            ids = _plane(answer)
             if ids.ndim != 2 or (ids != np.rint(ids)).any():
                 raise DataError(
                     f"{where}: found one channel of fractions, expected class ids or a channel per class"
@@ -111,7 +105,7 @@ class OnnxSegmenter:
             known = np.where((ids >= 0) & (ids < len(self._table) - 1), ids, len(self._table) - 1)
             resized = cv2.resize(known.astype(np.int32), (width, height), interpolation=cv2.INTER_NEAREST)
             return np.asarray(self._table[resized])
-        logits = np.moveaxis(np.asarray(answer[0], np.float32), self._output.axis - 1, 0)
+        logits = np.moveaxis(np.asarray(answer[0], np.float32), self._axis - 1, 0)
         return resized_softmax(_as_logits(logits)[self._kept], (height, width))
 
 
@@ -135,15 +129,6 @@ class _Input:
         """One image (h, w, 3), as often as the batch is long."""
         image = pixels if self.last else pixels.transpose(2, 0, 1)
         return {self.name: np.ascontiguousarray(np.repeat(image[None], self.batch, axis=0), self.dtype)}
-
-
-@dataclass(frozen=True)
-class _Output:
-    """Which output is taken."""
-
-    name: str
-    axis: int | None
-    """Of the classes; None: it holds class ids."""
 
 
 def _as_logits(output: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -176,65 +161,60 @@ def _open_session(path: Path, device: str) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads do not spin
     try:
         return onnxruntime.InferenceSession(path, options, available)
-    except ONNX_ERRORS as error:
+    except Exception as error:  # of any of its providers
+        raise DataError(f"onnx {shown(path)}: cannot be read ({one_line(error)}); export it again") from error
+
+
+def _probed(
+    session: Any, path: Path, told: Sequence[str] | None
+) -> tuple[_Input, str, int | None, int | None]:
+    """How images go in, which output is taken, the axis of its classes, and their number, as a grey image shows.
+
+    Without an axis it holds class ids.
+    """
+    port = _input_of(session, path)
+    size = port.whole(*PROBE)
+    try:
+        answers = session.run(None, port.feed(np.full((*size, 3), 0.5)))
+    except Exception as error:  # of any of its providers
         raise DataError(
-            f"onnx {shown(path)}: cannot be read ({_first_line(error)}); export it again"
-        ) from None
+            f"onnx:{path} on a grey image of {size[1]} x {size[0]} pixels: {one_line(error)}"
+        ) from error
+    outputs = [(output.name, answer) for output, answer in zip(session.get_outputs(), answers, strict=True)]
+    for name, answer in outputs:
+        if answer.ndim == 4 and answer.dtype.kind == "f" and 1 not in (answer.shape[1], answer.shape[3]):
+            axis = _axis_of_classes(answer.shape, size, port, told)
+            return port, name, axis, answer.shape[axis]
+    for name, answer in outputs:
+        if answer.dtype.kind in "iuf" and _plane(answer).ndim == 2:
+            if told is None:
+                raise ConfigError(
+                    f"onnx {path}: gives class ids without names; name them with ?classes=cityscapes"
+                )
+            return port, name, None, None
+    found = [(name, answer.dtype.name, answer.shape) for name, answer in outputs]
+    raise DataError(
+        f"onnx {path}: found outputs {found}, expected float (1, classes, height, width) or (1, height, width,"
+        " classes), or class ids (1, height, width)"
+    )
 
 
-def _probed(session: Any, path: Path, told: Sequence[str] | None) -> tuple[_Input, _Output, int | None]:
-    """How images go in and classes come out, as a run on a grey image shows, and their number (None: ids)."""
-    failed: Exception | None = None
-    for port in _inputs(session, path):
-        size = port.whole(*PROBE)
-        try:
-            answers = session.run(None, port.feed(np.full((*size, 3), 0.5)))
-        except Exception as error:  # noqa: BLE001 (the other layout may be right)
-            failed = failed or error
-            continue
-        outputs = list(zip(session.get_outputs(), answers, strict=True))
-        for output, answer in outputs:
-            if answer.ndim == 4 and answer.dtype.kind == "f" and 1 not in (answer.shape[1], answer.shape[3]):
-                axis = _axis_of_classes(answer.shape, size, port, told)
-                return port, _Output(output.name, axis), answer.shape[axis]
-        for output, answer in outputs:
-            if answer.dtype.kind in "iuf" and np.squeeze(answer[0] if answer.ndim > 2 else answer).ndim == 2:
-                if told is None:
-                    raise ConfigError(
-                        f"onnx {path}: gives class ids without names; name them with ?classes=cityscapes"
-                    )
-                return port, _Output(output.name, None), None
-        found = [(output.name, answer.dtype.name, answer.shape) for output, answer in outputs]
-        raise DataError(
-            f"onnx {path}: found outputs {found}, expected float (1, classes, height, width) or (1, height, width,"
-            " classes), or class ids (1, height, width)"
-        )
-    reason = "" if failed is None else _first_line(failed)
-    raise DataError(f"onnx:{path} on a grey image of {PROBE[1]} x {PROBE[0]} pixels: {reason}") from failed
+def _plane(answer: NDArray[Any]) -> NDArray[Any]:
+    return np.squeeze(answer[0] if answer.ndim > 2 else answer)
 
 
-def _inputs(session: Any, path: Path) -> list[_Input]:
-    """The input, as it may be meant: where no axis is known to be that of channels, in both ways."""
+def _input_of(session: Any, path: Path) -> _Input:
     inputs = session.get_inputs()
     shape = [side if isinstance(side, int) and side > 0 else None for side in inputs[0].shape] or [None] * 4
-    dtype = DTYPES.get(inputs[0].type)
-    ends = shape[1:4:2] if len(shape) == 4 else []
-    lasts = [ends.index(3) == 1] if 3 in ends else [False, True] if ends == [None, None] else []
-    if len(inputs) != 1 or dtype is None or not lasts:
+    dtype, ends = DTYPES.get(inputs[0].type), shape[1:4:2]
+    if len(inputs) != 1 or dtype is None or len(shape) != 4 or not (3 in ends or ends == [None, None]):
         found = [(i.name, i.type, i.shape) for i in inputs]
         raise DataError(
             f"onnx {path}: found inputs {found}, expected one of float (1, 3, height, width) or (1, height, width, 3)"
         )
-    return [
-        _Input(
-            inputs[0].name,
-            np.dtype(dtype),
-            last,
-            shape[0] or 1,
-            (shape[1 if last else 2], shape[2 if last else 3]),
-        )
-        for last in lasts
-    ]
+    last = ends[0] != 3 and (ends[1] == 3 or str(inputs[0].shape[-1:]).lower().startswith("['c"))
+    size = (shape[1], shape[2]) if last else (shape[2], shape[3])
+    return _Input(inputs[0].name, np.dtype(dtype), last, shape[0] or 1, size)
 
 
 def _axis_of_classes(
@@ -261,7 +241,3 @@ def _three_numbers(text: str, name: str, path: Path) -> NDArray[np.float32]:
             f"onnx {path}: found {name}={text}, expected three numbers joined by commas"
         ) from None
     return numbers
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]

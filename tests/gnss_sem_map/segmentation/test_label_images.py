@@ -242,14 +242,15 @@ def test_several_names_without_a_known_one_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "more", "message"),
     [
-        (np.full((24, 40, 3), (1, 2, 3), np.uint8), "", r"1 colour such as \[\(1, 2, 3\)\]"),
-        (np.random.default_rng(0).integers(0, 255, (24, 40, 3), np.uint8), "", "without blending"),
+        (np.full((24, 40, 3), (1, 2, 3), np.uint8), "", r"\['#010203'\], which are no colour of cityscapes"),
+        (np.random.default_rng(0).integers(0, 255, (24, 40, 3), np.uint8), "", "which are no colour of"),
         (
             np.full((24, 40), 120, np.uint8),
             "",
             r"ids \[120\], which are no train_id of cityscapes; .*\?taxonomy=",
         ),
-        (rgb("cityscapes"), "?ids=train_id", "found colours, expected train_id ids"),
+        (rgb("cityscapes"), "?taxonomy=ade20k", r"found \['#\w+', .*|found colours, expected train_id ids"),
+        (rgb("cityscapes"), "?ids=train_id", "found colours, expected train_id ids, not colours"),
         (ids("train_id").astype(np.uint8), "?ids=colour", "found ids, expected colours"),
         (np.full((24, 40), 60_123, np.uint16), "?ids=label_id", r"ids \[60\]"),
     ],

@@ -51,7 +51,8 @@ def save(
     kernel = helper.make_tensor(
         "k", TensorProto.FLOAT, (count, channels, 1, 1), weights.astype(np.float32).ravel()
     )
-    dims = ["any"] * 4 if size == "symbolic" else [[batch, channels, *size][i] for i in LAYOUT[layouts[0]]]
+    dims = [[batch, channels, *size][i] for i in LAYOUT[layouts[0]]]
+    dims = ["b", *(f"{of}_1" for of in layouts[0][1:])] if size == "symbolic" else dims
     inputs = [helper.make_tensor_value_info("pixels", TensorProto.UINT8 if kind == "uint8" else number, dims)]
     nodes = [
         helper.make_node("Cast", ["pixels"], ["cast"], to=TensorProto.FLOAT),

@@ -66,6 +66,12 @@ class CachedLabels:
             self.class_names = ()
         self._try(label_set)
 
+    @property
+    def remedy(self) -> str:
+        """What to do where they are not what they should be."""
+        make = "make the labels again (gnss-sem-map segment)"
+        return make if self._meaning is None else f"{make}, or say what the ids are (labels:FOLDER?ids=...)"
+
     def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
         """The probabilities of this frame; raises MissingLabels if there are none, DataError for a bad file."""
         seen = self.kept(image)
@@ -75,8 +81,10 @@ class CachedLabels:
         """The result of `__call__`, with a label image not expanded: most of its pixels are never used."""
         path = self._files.get((image.camera, image.number))
         if path is None:
+            numbers = [number for _, number in self._files]
             raise MissingLabels(
-                f"{self._folder}: no labels of frame {image.frame}; {len(self._files)} frames have some"
+                f"{self._folder}: no labels of frame {image.frame}; {len(self._files)} frames have some, from"
+                f" {min(numbers)} to {max(numbers)}"
             )
         return self._read(path, self._sizes.get(image.camera))
 
@@ -166,5 +174,7 @@ def _label_files(
             return files, suffix, told
     folders = [shown(path.name) for path in paths if path.is_dir()]
     hint = f"; did you mean one of its folders {folders[:8]}?" if folders else ""
+    others = sorted({path.suffix for path in paths if path.is_file() and path.suffix})
+    hint += f"; found {', '.join(map(shown, others[:8]))} there: save them as PNG" if others else ""
     where = "it" if "" in cameras else f"the folders of the cameras, {', '.join(cameras)}"
     raise DataError(f"labels {shown(folder)}: found no <frame number>.npz or .png in {where}{hint}")

@@ -97,6 +97,10 @@ def _load(model: str) -> tuple[Any, Any]:
     except DataError:
         raise
     except (OSError, ValueError, RuntimeError) as error:
+        if Path(model).is_file() or model.startswith((".", "/", "~")) or model.count("/") > 1:
+            raise DataError(
+                f"hf:{model}: no such folder; expected one with config.json and the weights, or the name of a model"
+            ) from None
         if not Path(model).is_dir():
             raise DataError(
                 f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"

@@ -60,7 +60,9 @@ def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
     try:
         function = getattr(importlib.import_module(module), name)
     except ModuleNotFoundError as error:
-        raise ConfigError(f"python:{place}: {error}; is its folder on PYTHONPATH?") from None
+        own = f"{module}.".startswith(f"{error.name}.")  # else one that it imports
+        advice = "is its folder on PYTHONPATH?" if own else "it imports that: install it"
+        raise ConfigError(f"python:{place}: {error}; {advice}") from None
     except AttributeError:
         raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
     except Exception as error:  # and so may the import of its module

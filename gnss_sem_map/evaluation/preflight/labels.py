@@ -63,8 +63,8 @@ def check(sample: CameraSample, against_lidar: bool) -> Iterator[Finding]:
         yield (red if len(refused) > MOST_REFUSED * count else amber)(
             NAME,
             f"{len(refused)} of {count} label files looked at are refused, such as {refused[0]}",
-            "label files are damaged, of other images, or hold ids of another kind",
-            "make them again, or say what their ids are (labels:FOLDER?ids=...)",
+            "label files are damaged, of other images, or of other classes",
+            segmenter.remedy,
         )
     elif not seen and missing:
         yield amber(
@@ -75,7 +75,7 @@ def check(sample: CameraSample, against_lidar: bool) -> Iterator[Finding]:
         )
     if not seen:
         return
-    content = _content(seen, segmenter.class_names)
+    content = _content(seen, segmenter.class_names, segmenter.remedy)
     yield content
     if against_lidar and not content.mistake:
         yield _place(sample, replace(edges, views=tuple(views)))
@@ -102,7 +102,7 @@ def classes_of(labels: NDArray[np.uint8] | NDArray[np.float32] | LabelImage) -> 
     return np.where(some.any(axis=2), some.argmax(axis=2), UNKNOWN)
 
 
-def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...]) -> Finding:
+def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...], remedy: str) -> Finding:
     known = np.concatenate([classes[classes != UNKNOWN] for classes in seen])
     share = len(known) / sum(classes.size for classes in seen)
     if share < LEAST_KNOWN:
@@ -110,7 +110,7 @@ def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...]) -> Finding:
             NAME,
             f"{share:.1%} of the pixels of {len(seen)} label files have any class",
             "labels are all zero: they hold no class at all",
-            "make the labels again (gnss-sem-map segment)",
+            remedy,
         )
     counts = np.bincount(known)
     top = int(counts.argmax())
@@ -122,7 +122,7 @@ def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...]) -> Finding:
             NAME,
             found,
             f"labels have one class, {name}, nearly everywhere, the sky as well: all zero, or ids of another kind",
-            "make the labels again, or say what the ids are (labels:FOLDER?ids=...)",
+            remedy,
         )
     return green(NAME, found)
 

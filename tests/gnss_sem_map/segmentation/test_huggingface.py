@@ -390,6 +390,12 @@ def test_a_model_that_is_not_on_this_machine_is_answered_with_how_to_get_it() ->
         open_segmenter("hf:nobody/nothing", URBAN)
 
 
+@pytest.mark.parametrize("path", ["./nowhere", "/nowhere/net", "runs/net/checkpoint-900"])
+def test_a_folder_that_is_not_there_is_not_taken_for_a_model_of_the_hub(path: str) -> None:
+    with pytest.raises(DataError, match=r"no such folder; expected one with config\.json"):
+        open_segmenter(f"hf:{path}", URBAN)
+
+
 def test_a_network_that_does_not_segment_is_refused(tmp_path: Path) -> None:
     transformers.ViTConfig(hidden_size=8, num_hidden_layers=1).save_pretrained(tmp_path)
     with pytest.raises(DataError, match="a vit is no segmentation network"):

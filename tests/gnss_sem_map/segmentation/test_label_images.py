@@ -271,3 +271,15 @@ def test_the_sixteen_bits_of_minus_one_are_void(tmp_path: Path) -> None:
     seen = classes_seen(tmp_path)
     assert (seen[0] == -1).all()
     np.testing.assert_array_equal(seen[1:], TRUTH[1:])
+
+
+def test_other_files_and_other_frames_are_named(tmp_path: Path) -> None:
+    Picture.fromarray(rgb("cityscapes")).save(tmp_path / "3.jpg")
+    with pytest.raises(
+        DataError, match=r"found no <frame number>\.npz or \.png in it; found \.jpg there: save them as PNG"
+    ):
+        classes_seen(tmp_path)
+    for number in (1000, 1039):
+        save(tmp_path / f"{number}.png", ids("train_id").astype(np.uint8))
+    with pytest.raises(DataError, match="no labels of frame 3; 2 frames have some, from 1000 to 1039"):
+        classes_seen(tmp_path)

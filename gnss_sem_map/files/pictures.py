@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,17 +64,10 @@ def decoded_picture(
 class LabelPixels:
     """The values of a label image: grey ones are ids, colours are colours, those by a palette may be either."""
 
-    ids: NDArray[np.uint8] | NDArray[np.uint16] | None
-    """(h, w)."""
-    colours: NDArray[np.int32] | None
-    """(h, w), 0xRRGGBB."""
-
-    def some(self, most: int) -> LabelPixels:
-        """About `most` of the pixels at equal steps, (k,)."""
-        one = self.ids if self.colours is None else self.colours
-        step = 1 if one is None else -(-one.size // most)
-        some = (None if values is None else values.ravel()[::step] for values in (self.ids, self.colours))
-        return LabelPixels(*some)  # type: ignore[arg-type]
+    ids: NDArray[Any] | None
+    """(h, w), uint8 or uint16."""
+    colours: NDArray[Any] | None
+    """(h, w), int32: 0xRRGGBB."""
 
 
 def read_labels(path: Path) -> LabelPixels:

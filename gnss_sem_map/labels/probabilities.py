@@ -42,7 +42,7 @@ HARD_LABEL_PROBABILITY = 0.9
 
 def of_hard_labels(count: int) -> NDArray[np.float32]:
     """Class probabilities (count, count) of a pixel of each class, where only its class is told."""
-    rest = (1 - HARD_LABEL_PROBABILITY) / (count - 1)
+    rest = (1 - HARD_LABEL_PROBABILITY) / max(count - 1, 1)
     return np.where(np.eye(count, dtype=bool), HARD_LABEL_PROBABILITY, rest).astype(np.float32)
 
 

@@ -12,13 +12,18 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.files.untrusted import inside, is_folder, shown
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
-from gnss_sem_map.labels.probabilities import LabelImage, check_shape, checked_probabilities, shrink_of
+from gnss_sem_map.labels.probabilities import (
+    LabelImage,
+    check_shape,
+    checked_probabilities,
+    of_hard_labels,
+    shrink_of,
+)
 from gnss_sem_map.segmentation import MissingLabels
 from gnss_sem_map.segmentation.classes import check_some_known
 from gnss_sem_map.segmentation.label_images import (
     Meaning,
     by_frame,
-    evidence_of_classes,
     meaning_of,
     none_usable,
 )
@@ -56,8 +61,10 @@ class CachedLabels:
             where = f"labels {shown(folder)}"
             kind = ids or (told if taxonomy is None else None)
             self._meaning = meaning_of(self._some_files(), label_set, taxonomy, kind, where)
-            self._evidence = evidence_of_classes(label_set)
             self.class_names: tuple[str, ...] = (*label_set.names, OTHER)
+            count = len(self.class_names)
+            self._evidence = np.zeros((256, count), np.uint8)  # void has none
+            self._evidence[:count] = np.rint(255 * of_hard_labels(count))
         elif ids is not None:
             raise ConfigError(
                 f"labels {folder}: found .npz probabilities, where ids={ids} means nothing; leave it out"

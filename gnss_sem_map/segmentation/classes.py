@@ -45,11 +45,10 @@ def named_classes(
     elif own is None and usual is not None:
         names = tuple(_expand(usual, label_set))
     else:
-        found = f" but numbers ({own[0]}, ...)" if own else ""
-        raise ConfigError(
-            f"{where}: found {count} classes without names{found}; name them with"
-            f" ?classes={usual or 'road,sidewalk,...'}"
-        )
+        found = f"{'ids of' if count is None else count} classes"
+        numbers = f" but numbers ({own[0]}, ...)" if own else ""
+        advice = "cityscapes" if count is None else usual or "road,sidewalk,..."
+        raise ConfigError(f"{where}: found {found} without names{numbers}; name them with ?classes={advice}")
     if len(names) != (len(names) if count is None else count):
         raise ConfigError(
             f"{where}: found {count} classes for {len(names)} names {list(names)}; expected one each"

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.pictures import LabelPixels, read_labels
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, Taxonomy, shipped_taxonomies, taxonomy
-from gnss_sem_map.labels.probabilities import of_hard_labels
 
 USUAL = "cityscapes"
 COLOUR = "colour"
@@ -58,9 +58,7 @@ class Meaning:
             )
         return seen
 
-    def values(
-        self, pixels: LabelPixels, where: str
-    ) -> NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.int32]:
+    def values(self, pixels: LabelPixels, where: str) -> NDArray[Any]:
         """The values of this kind, (h, w); raises DataError where the file has the others only."""
         values = pixels.colours if self.kind == COLOUR else pixels.ids
         if values is None:
@@ -85,7 +83,7 @@ def meaning_of(
     pictures, refused = list[LabelPixels](), list[DataError]()
     for path in files:
         try:
-            pictures.append(read_labels(path).some(LOOKED_AT))
+            pictures.append(_some(read_labels(path)))
         except DataError as error:
             refused.append(error)
     if not pictures:
@@ -114,12 +112,12 @@ def none_usable(refused: Sequence[DataError]) -> DataError:
     return DataError(f"{refused[0]}{more}")
 
 
-def evidence_of_classes(label_set: LabelSet) -> NDArray[np.uint8]:
-    """Of every code (256, c + 1): its class gets HARD_LABEL_PROBABILITY, the others share the rest, void has none."""
-    count = len(label_set.names) + 1
-    evidence = np.zeros((256, count), np.uint8)
-    evidence[:count] = np.rint(255 * of_hard_labels(count))
-    return evidence
+def _some(pixels: LabelPixels) -> LabelPixels:
+    """At most LOOKED_AT of the pixels, at equal steps, (k,)."""
+    ids, colours = (
+        None if v is None else v.ravel()[:: -(-v.size // LOOKED_AT)] for v in (pixels.ids, pixels.colours)
+    )
+    return LabelPixels(ids, colours)
 
 
 def reading(source: Taxonomy, label_set: LabelSet, kind: str, highest: int = 0) -> Meaning:

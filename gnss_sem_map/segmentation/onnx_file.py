@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,18 +67,13 @@ class OnnxSegmenter:
             (0, 1, 2) if order == "rgb" else (2, 1, 0),
             np.float32(255 / float(pixel_max)),
         )
-        told = None if classes is None else named_classes(classes, None, label_set, str(path))
+        told = 0 if classes is None else len(named_classes(classes, None, label_set, str(path)))
         self._input, self._output, self._axis, count = _probed(self._session, path, told)
-        names = told or named_classes(None, count, label_set, str(path))
-        if count not in (None, len(names)):
-            raise ConfigError(
-                f"{path}: found {count} classes for {len(names)} names {list(names)}; expected one each"
-            )
+        names = named_classes(classes, count, label_set, f"onnx {path}")
         self._kept = [i for i, name in enumerate(names) if name != VOID]
         self.class_names = tuple(names[i] for i in self._kept)
-        self._table = np.zeros(
-            (len(names) + 1, len(self._kept)), np.float32
-        )  # the last row is of unknown ids
+        # the last row is of unknown ids
+        self._table = np.zeros((len(names) + 1, len(self._kept)), np.float32)
         self._table[self._kept] = of_hard_labels(len(self._kept))
 
     def __call__(self, image: Image) -> NDArray[np.float32]:
@@ -165,9 +159,7 @@ def _open_session(path: Path, device: str) -> Any:
         raise DataError(f"onnx {shown(path)}: cannot be read ({one_line(error)}); export it again") from error
 
 
-def _probed(
-    session: Any, path: Path, told: Sequence[str] | None
-) -> tuple[_Input, str, int | None, int | None]:
+def _probed(session: Any, path: Path, told: int) -> tuple[_Input, str, int | None, int | None]:
     """How images go in, which output is taken, the axis of its classes, and their number, as a grey image shows.
 
     Without an axis it holds class ids.
@@ -187,10 +179,6 @@ def _probed(
             return port, name, axis, answer.shape[axis]
     for name, answer in outputs:
         if answer.dtype.kind in "iuf" and _plane(answer).ndim == 2:
-            if told is None:
-                raise ConfigError(
-                    f"onnx {path}: gives class ids without names; name them with ?classes=cityscapes"
-                )
             return port, name, None, None
     found = [(name, answer.dtype.name, answer.shape) for name, answer in outputs]
     raise DataError(
@@ -217,11 +205,9 @@ def _input_of(session: Any, path: Path) -> _Input:
     return _Input(inputs[0].name, np.dtype(dtype), last, shape[0] or 1, size)
 
 
-def _axis_of_classes(
-    shape: tuple[int, ...], size: tuple[int, int], port: _Input, told: Sequence[str] | None
-) -> int:
+def _axis_of_classes(shape: tuple[int, ...], size: tuple[int, int], port: _Input, told: int) -> int:
     """1 or 3: the other two axes are as high and wide as the input, or that divided; else the one of a known length."""
-    counts = BY_COUNT if told is None else (len(told),)
+    counts = (told,) if told else BY_COUNT
 
     def doubt(axis: int) -> tuple[bool, bool, bool]:
         height, width = shape[2:] if axis == 1 else shape[1:3]

@@ -47,31 +47,24 @@ def check(sample: CameraSample, against_lidar: bool) -> Iterator[Finding]:
         return
     views: list[View] = []
     seen: list[NDArray[np.int64]] = []
-    missing: list[DataError] = []
-    refused: list[DataError] = []
+    errors: list[DataError] = []
     for view, image in zip(edges.views, sample.edge_images, strict=True):
         try:
             classes = classes_of(segmenter.kept(image))
         except DataError as error:
-            (missing if isinstance(error, MissingLabels) else refused).append(error)
+            errors.append(error)
             continue
         seen.append(classes)
         coarse, fine = border_strength(classes, sample.camera.image_size)
         views.append(View(view.p_map, view.weights, view.stamp, coarse, fine))
-    if refused:
-        count = len(seen) + len(refused)
+    refused = [error for error in errors if not isinstance(error, MissingLabels)]
+    if lost := refused or (errors if not seen else []):
+        count = len(seen) + len(lost)
         yield (red if len(refused) > MOST_REFUSED * count else amber)(
             NAME,
-            f"{len(refused)} of {count} label files looked at are refused, such as {refused[0]}",
-            "label files are damaged, of other images, or of other classes",
-            segmenter.remedy,
-        )
-    elif not seen and missing:
-        yield amber(
-            NAME,
-            f"none of {len(missing)} frames looked at has labels: {missing[0]}",
-            "labels are of other frames",
-            "check the frame numbers in the names of the label files",
+            f"labels of {len(lost)} of {count} frames looked at are refused or missing: {lost[0]}",
+            "label files are damaged, of other frames, or of other classes",
+            segmenter.remedy if refused else "check the frame numbers in the names of the label files",
         )
     if not seen:
         return

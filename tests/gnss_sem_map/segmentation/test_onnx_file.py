@@ -186,7 +186,9 @@ def test_of_several_outputs_that_of_the_logits_is_taken(tmp_path: Path, kind: st
 )
 def test_class_ids_become_the_probabilities_of_label_images(tmp_path: Path, kind: str) -> None:
     path = save(tmp_path / "net.onnx", WEIGHTS, kind=kind)
-    with pytest.raises(ConfigError, match=r"ids without names; name them with \?classes=cityscapes"):
+    with pytest.raises(
+        ConfigError, match=r"found ids of classes without names; name them with \?classes=cityscapes"
+    ):
         open_segmenter(f"onnx:{path}", URBAN, "cpu")
     plain = open_segmenter(f"onnx:{save(tmp_path / 'a.onnx', WEIGHTS)}?shrink=1", URBAN, "cpu")(camera())
     seen = open_segmenter(f"onnx:{path}?classes=kitti6&shrink=1", URBAN, "cpu")(camera())

@@ -265,7 +265,7 @@ def test_label_files_that_are_refused_are_counted(
         path.write_bytes(path.read_bytes()[:-30])
     found = [one for one in camera.check(Sample(log, Settings(), segmenter)) if one.check == "labels"]
     assert found[0].level is level
-    assert f"{seen} of 10 label files looked at are refused, such as" in found[0].evidence
+    assert f"labels of {seen} of 10 frames looked at are refused or missing: " in found[0].evidence
     assert "?ids=" not in found[0].remedy  # probabilities have none
 
 

@@ -96,16 +96,16 @@ def _load(model: str) -> tuple[Any, Any]:
             )
     except DataError:
         raise
-    except (OSError, ValueError, RuntimeError) as error:
-        if Path(model).is_file() or model.startswith((".", "/", "~")) or model.count("/") > 1:
+    except Exception as error:  # of a file of settings, of one of tensors, or of a package that is not there
+        if Path(model).is_dir():
+            raise DataError(f"hf:{model}: cannot be read ({one_line(error)})") from error
+        if Path(model).exists() or model.startswith((".", "/", "~")) or model.count("/") > 1:
             raise DataError(
                 f"hf:{model}: no such folder; expected one with config.json and the weights, or the name of a model"
             ) from None
-        if not Path(model).is_dir():
-            raise DataError(
-                f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
-            ) from None
-        raise DataError(f"hf:{model}: cannot be read ({one_line(error)})") from None
+        raise DataError(
+            f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
+        ) from None
     unset = sorted([*report["missing_keys"], *report["mismatched_keys"]])
     if unset:
         raise DataError(

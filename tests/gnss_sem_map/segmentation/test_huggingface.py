@@ -14,8 +14,10 @@ from torch.nn.functional import interpolate
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
 
 from gnss_sem_map.errors import ConfigError, DataError  # noqa: E402
-from gnss_sem_map.labels.label_set import open_label_set  # noqa: E402
+from gnss_sem_map.labels.label_set import open_label_set, taxonomy  # noqa: E402
 from gnss_sem_map.segmentation import open_segmenter  # noqa: E402
+from gnss_sem_map.segmentation.cache import quantised  # noqa: E402
+from gnss_sem_map.segmentation.classes import unknown_classes  # noqa: E402
 from gnss_sem_map.sensor_log import Image  # noqa: E402
 
 URBAN = open_label_set("urban")
@@ -378,6 +380,35 @@ def test_classes_can_be_named_where_the_model_has_only_numbers(tmp_path: Path) -
     assert segment.class_names[:2] == ("sky", "building")
 
 
+@pytest.mark.parametrize(
+    ("source", "spelling", "known"),
+    [
+        ("ade20k", str, 150),
+        ("mapillary", str, 65),
+        ("cityscapes", lambda name: name.replace(" ", "_").upper(), 19),
+    ],
+)
+def test_networks_of_public_data_sets_need_no_names(
+    tmp_path: Path, source: str, spelling: Any, known: int
+) -> None:
+    table = taxonomy(source).ids[taxonomy(source).usual_ids]
+    names = [spelling(name) for name in sorted(table, key=lambda name: table[name])]
+    config = transformers.SegformerConfig(
+        hidden_sizes=[8, 16, 24, 32], depths=[1, 1, 1, 1], num_attention_heads=[1, 1, 2, 2],
+        decoder_hidden_size=16, id2label=dict(enumerate(names)), label2id={name: i for i, name in enumerate(names)},
+    )  # fmt: skip
+    saved(tmp_path, transformers.SegformerForSemanticSegmentation(config))
+    segment = open_segmenter(f"hf:{tmp_path}", URBAN, device="cpu")
+    assert unknown_classes(segment.class_names, URBAN) is None
+    seen = segment(camera())
+    assert seen.shape[2] == known
+    summed = quantised(seen, segment.class_names, URBAN)
+    ours = [URBAN.of_source(source, name) for name in sorted(table, key=lambda name: table[name])]
+    vehicle = [i for i, target in enumerate(ours) if target == URBAN.index("vehicle")]
+    assert len(vehicle) > 4
+    np.testing.assert_allclose(summed[:, :, URBAN.index("vehicle")], 255 * seen[:, :, vehicle].sum(2), atol=2)
+
+
 def test_opening_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     saved(tmp_path, segformer())
     capfd.readouterr()
@@ -406,6 +437,15 @@ def test_a_network_that_needs_a_task_is_refused_without_its_tokenizer(tmp_path: 
     oneformer().save_pretrained(tmp_path)
     with pytest.raises(DataError, match="tokenizer does not know"):
         open_segmenter(f"hf:{tmp_path}", URBAN)
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json"])
+def test_a_damaged_file_is_one_line(tmp_path: Path, name: str) -> None:
+    saved(tmp_path, segformer())
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:40])
+    with pytest.raises(DataError, match=rf"hf:{tmp_path}: cannot be read \(") as caught:
+        open_segmenter(f"hf:{tmp_path}", URBAN)
+    assert "\n" not in str(caught.value)
 
 
 def test_weights_that_lack_tensors_are_refused(tmp_path: Path) -> None:

@@ -241,7 +241,10 @@ def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> La
 
 
 def taxonomy(name_or_file: str | Path) -> Taxonomy:
-    """Read a taxonomy: the name of a shipped one, or the user's YAML file. Raises ConfigError."""
+    """Read a taxonomy: the name of a shipped one, or the user's YAML file. Raises ConfigError.
+
+    Classes that are names alone have ids in their order, from those that `ids` gives for the first.
+    """
     content = _read(name_or_file, "taxonomy", shipped_taxonomies())
     try:
         kinds = [_word(kind) for kind in content["ids"]]

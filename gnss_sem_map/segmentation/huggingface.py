@@ -97,7 +97,7 @@ def _load(model: str) -> tuple[Any, Any]:
     except DataError:
         raise
     except Exception as error:  # of a file of settings, of one of tensors, or of a package that is not there
-        if Path(model).is_dir():
+        if Path(model).is_dir() or not isinstance(error, OSError | ValueError):
             raise DataError(f"hf:{model}: cannot be read ({one_line(error)})") from error
         if Path(model).exists() or model.startswith((".", "/", "~")) or model.count("/") > 1:
             raise DataError(

@@ -341,6 +341,22 @@ def checkpoint(suffix: str, folder: Path) -> Reader:
     return Reader(file, lambda: read_checkpoint(file), mutations.binary)
 
 
+def image_processor(folder: Path) -> Reader:
+    """The settings of the image processor of a network of transformers."""
+    from transformers import SegformerConfig
+
+    from gnss_sem_map.segmentation.huggingface import _prepare
+
+    folder.mkdir(parents=True)
+    about = {"image_processor_type": "SegformerImageProcessor", "image_mean": [0.5, 0.4, 0.3], "do_rescale": True,
+             "rescale_factor": 0.004, "image_std": [0.2, 0.2, 0.2], "size": {"height": 512, "width": 512}}  # fmt: skip
+    file = folder / "preprocessor_config.json"
+    file.write_text(json.dumps(about, indent=1))
+    SegformerConfig().save_pretrained(folder)
+    pixels = np.zeros((1, 32, 64, 3), np.uint8)
+    return Reader(file, lambda: _prepare(str(folder), SegformerConfig())(pixels), mutations.text)
+
+
 READERS: dict[str, Callable[[Path], Reader]] = {
     "oxts row": functools.partial(kitti, "oxts/data/0000000002.txt", mutations.text),
     "oxts stamps": functools.partial(kitti, "oxts/timestamps.txt", mutations.text),
@@ -364,6 +380,7 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "label PNG of 16 bits": functools.partial(label_image, "I;16"),
     "label PNG by a palette": functools.partial(label_image, "P"),
     "label PNG of colours": functools.partial(label_image, "RGB"),
+    "image processor": image_processor,
     "probabilities": probabilities,
     "point labels": point_labels,
     "TUM": tum,

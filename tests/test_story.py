@@ -291,6 +291,20 @@ def test_segmenting_again_says_that_nothing_was_to_do(small_drive: Street, tmp_p
         assert f"now use --segmenter labels:{tmp_path}" in done.stdout
 
 
+def test_segmenting_lists_class_names_that_nobody_knows(small_drive: Street, tmp_path: Path) -> None:
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    for path in small_drive.labels.iterdir():
+        with np.load(path) as content:
+            names = ["blimp" if name == "other" else name for name in content["class_names"].tolist()]
+            np.savez_compressed(labels / path.name, probabilities=content["probabilities"], class_names=names)
+    spec = f"labels:{labels}"
+    done = gnss_sem_map("segment", small_drive.drive, "--segmenter", spec, "-o", tmp_path / "out")
+    assert done.returncode == 0
+    said = "warning: {}: 1 of 6 class names are unknown and count as other: blimp"
+    assert done.stderr.splitlines().count(said.format(spec)) == 1
+
+
 def test_a_run_is_not_merged_with_itself(raw_run: Path, tmp_path: Path) -> None:
     link = tmp_path / "link"
     link.symlink_to(raw_run)

@@ -29,10 +29,13 @@ def segment(
     from gnss_sem_map.labels.label_set import open_label_set
     from gnss_sem_map.segmentation import open_segmenter
     from gnss_sem_map.segmentation.cache import write_cache
+    from gnss_sem_map.segmentation.classes import unknown_classes
 
     log = open_log(drive, drive_format, None)
     label_set = open_label_set(classes)
     network = open_segmenter(segmenter, label_set, device, log.calibration.image_sizes)
+    if unknown := unknown_classes(network.class_names, label_set):
+        warn([f"{segmenter}: {unknown}"])
     with progress_bars() as progress:
         try:
             report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)

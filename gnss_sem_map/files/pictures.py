@@ -8,7 +8,9 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,16 +60,35 @@ def decoded_picture(
         return np.array(picture.convert("RGB"))
 
 
-def read_ids(path: Path) -> NDArray[np.uint8]:
-    """The values (h, w) of an 8-bit grey PNG; raises DataError for anything else."""
+@dataclass(frozen=True, eq=False)
+class LabelPixels:
+    """The values of a label image: grey ones are ids, colours are colours, those by a palette may be either."""
+
+    ids: NDArray[Any] | None
+    """(h, w), uint8 or uint16."""
+    colours: NDArray[Any] | None
+    """(h, w), int32: 0xRRGGBB."""
+
+
+def read_labels(path: Path) -> LabelPixels:
+    """The values of a PNG: grey of up to 16 bits, by a palette, or colours of 8 bits; raises DataError for others."""
     content = read_bytes(path, MOST_FILE_BYTES)
     with _opened(shown(path), content) as picture:
-        if not content.startswith(PNG) or picture.mode != "L" or _depth(content) != 8:
+        depth, grey = _depth(content), picture.mode in ("1", "L", "LA", "I", "I;16", "I;16B")
+        if not content.startswith(PNG) or (depth > 8 and (not grey or picture.mode == "LA")):
             raise DataError(
-                f"{shown(path)}: found {_described(picture, content)}, expected an 8-bit grey PNG of class ids,"
-                " not colours"
+                f"{shown(path)}: found {_described(picture, content)}, expected a PNG of class ids of 8 or 16 bits, or"
+                " of colours of 8 bits"
             )
-        return np.array(picture)
+        if grey:
+            whole = picture.getchannel(0) if picture.mode == "LA" else picture
+            if depth > 8:
+                return LabelPixels(np.array(whole, np.uint16), None)
+            # Pillow spreads grey values of less than 8 bits over 0 to 255, but for those of one bit
+            step = 255 // (2**depth - 1) if depth > 1 else 1
+            return LabelPixels(np.array(whole, np.uint8) // np.uint8(step), None)
+        red, green, blue, _ = np.array(picture.convert("RGBA"), np.int32).transpose(2, 0, 1)
+        return LabelPixels(np.array(picture) if picture.mode == "P" else None, red << 16 | green << 8 | blue)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ A `LabelSet` holds the classes of the map; a `Taxonomy` holds those of a network
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -117,13 +118,23 @@ class LabelSet:
     def table_from(self, source_names: Sequence[str]) -> NDArray[np.float32]:
         """The (s, c + 1) 0/1 matrix that sums the probabilities of s source classes into ours and, last, `other`.
 
-        A name may be one of ours, `other`, or of any source, provided that these agree. Raises ConfigError for an
-        unknown name.
+        A name may be one of ours, `other`, or of any source, provided that these agree, and counts as `other` where it
+        is `unknown`. Several of one name add up. Raises ConfigError for a name of which sources disagree.
         """
         table = np.zeros((len(source_names), len(self.names) + 1), np.float32)
         for row, name in enumerate(source_names):
-            table[row, self._target(name)] = 1.0
+            target = self._target(name)
+            table[row, len(self.names) if target is None else target] = 1.0
         return table
+
+    def unknown(self, source_names: Sequence[str]) -> list[str]:
+        """The names that are none of ours nor of any source, each once."""
+        return [name for name in dict.fromkeys(source_names) if self._target(name) is None]
+
+    def not_known(self, name: str) -> str:
+        """What is said of an unknown class, with the most similar name."""
+        everything = sorted(set(self.names).union(*self._known.values()))
+        return f"class {name!r} is unknown to the class set {self.name!r}{_did_you_mean(name, everything)}"
 
     def of_source(self, source: str, name: str) -> int:
         """Index of the class for a name of a taxonomy, c for `other`; raises ConfigError without a table of it."""
@@ -143,24 +154,30 @@ class LabelSet:
             for source, table in self.sources.items()
         }
 
-    def _target(self, name: str) -> int:
-        if name == OTHER:
-            return len(self.names)
-        if name in self.names:
-            return self.names.index(name)
-        targets = {self.of_source(source, name) for source, names in self._known.items() if name in names}
-        if len(targets) == 1:
-            return targets.pop()
-        everything = sorted(set(self.names).union(*self._known.values()))
-        if not targets:
-            raise ConfigError(
-                f"class {name!r} is unknown to the class set {self.name!r}{_did_you_mean(name, everything)};"
-                " name it `other` or add it to the `sources` of the class set file"
-            )
-        ours = [(*self.names, OTHER)[target] for target in sorted(targets)]
-        raise ConfigError(
-            f"class {name!r} is ambiguous in the class set {self.name!r}: {ours}; name it as one of these"
-        )
+    @cached_property
+    def _targets(self) -> dict[str, set[int]]:
+        """Where a name goes, for every name as it is written in a source and as `_plain` words."""
+        found: dict[str, set[int]] = {}
+        for spelling in (str, _plain):
+            exact = set(found)
+            for source, names in self._known.items():
+                for name in names:
+                    if (key := spelling(name)) not in exact:
+                        found.setdefault(key, set()).add(self.of_source(source, name))
+        ours = {name: {i} for i, name in enumerate((*self.names, OTHER))}
+        return found | {_plain(name): target for name, target in ours.items()} | ours
+
+    def _target(self, name: str) -> int | None:
+        """The column of a class; of a name with synonyms (`road, route`), of the first that is known."""
+        for word in (name, _plain(name), *map(_plain, re.split("[,;]", name))):
+            if targets := self._targets.get(word):
+                if len(targets) == 1:
+                    return next(iter(targets))
+                ours = [(*self.names, OTHER)[target] for target in sorted(targets)]
+                raise ConfigError(
+                    f"class {name!r} is ambiguous in the class set {self.name!r}: {ours}; name it as one of these"
+                )
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +187,7 @@ class Taxonomy:
     name: str
     names: tuple[str, ...]
     ids: Mapping[str, Mapping[str, int]]
-    """For each kind of id (such as `train_id`): class name -> id."""
+    """For each kind of id (such as `train_id`, or `colour`, as 0xRRGGBB): class name -> id."""
     void: Mapping[str, tuple[int, ...]]
     """For each kind of id: the ids without a class."""
 
@@ -183,7 +200,7 @@ class Taxonomy:
         """Table from id to class index: c is `other`, -1 void, -2 an unknown id."""
         table = np.full(size, -2, np.int16)
         table[[i for i in self.void[kind] if 0 <= i < size]] = UNLABELLED
-        for name in self.names:
+        for name in reversed(self.names):  # of two with one colour, the first
             row = label_set.of_source(self.name, name)
             if 0 <= self.ids[kind].get(name, -1) < size:
                 table[self.ids[kind][name]] = row
@@ -224,20 +241,25 @@ def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> La
 
 
 def taxonomy(name_or_file: str | Path) -> Taxonomy:
-    """Read a taxonomy: the name of a shipped one, or the user's YAML file. Raises ConfigError."""
-    shipped = [name for name in _shipped() if name not in SHIPPED_CLASS_SETS]
-    content = _read(name_or_file, "taxonomy", shipped)
+    """Read a taxonomy: the name of a shipped one, or the user's YAML file. Raises ConfigError.
+
+    Classes that are names alone have ids in their order, from those that `ids` gives for the first.
+    """
+    content = _read(name_or_file, "taxonomy", shipped_taxonomies())
     try:
-        classes, kinds = content["classes"], [_word(kind) for kind in content["ids"]]
+        kinds = [_word(kind) for kind in content["ids"]]
+        classes = [
+            c
+            if isinstance(c, Mapping)
+            else {"name": c} | {k: first + i for k, first in content["ids"].items()}
+            for i, c in enumerate(content["classes"])
+        ]
         void = content.get("void", {})
         return Taxonomy(
             name=_word(content["name"]),
             names=tuple(_word(c["name"]) for c in classes),
-            ids={
-                kind: {_word(c["name"]): _whole(c[kind], 1 << 16) for c in classes if kind in c}
-                for kind in kinds
-            },
-            void={kind: tuple(_whole(i, 1 << 16) for i in void.get(kind, ())) for kind in kinds},
+            ids={kind: {_word(c["name"]): _code(c[kind]) for c in classes if kind in c} for kind in kinds},
+            void={kind: tuple(map(_code, void.get(kind, ()))) for kind in kinds},
         )
     except _CONTENT_ERRORS as error:
         raise ConfigError(
@@ -266,6 +288,19 @@ def _whole(value: Any, below: int) -> int:
     return value
 
 
+def _code(value: Any) -> int:
+    """An id, or a colour (red, green, blue) as one number."""
+    if not isinstance(value, list):
+        return _whole(value, 1 << 16)
+    red, green, blue = (_whole(part, 256) for part in value)
+    return red << 16 | green << 8 | blue
+
+
+def _plain(name: str) -> str:
+    """A name as it is compared where its spelling is not that of a source: small letters, words apart by one space."""
+    return " ".join(re.split(r"[\s_-]+", name.strip().lower()))
+
+
 _SHIPPED = resources.files("gnss_sem_map") / "labels"
 
 
@@ -274,6 +309,11 @@ def _shipped() -> list[str]:
     """Names of the class sets and taxonomies that ship with us."""
     files = [Path(file.name) for file in _SHIPPED.iterdir()]
     return sorted(file.stem for file in files if file.suffix == ".yaml")
+
+
+def shipped_taxonomies() -> list[str]:
+    """Names of the taxonomies that ship with us."""
+    return [name for name in _shipped() if name not in SHIPPED_CLASS_SETS]
 
 
 def _read(name_or_file: str | Path, what: str, available: Sequence[str]) -> dict[str, Any]:

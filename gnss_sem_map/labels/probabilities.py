@@ -36,6 +36,16 @@ class KeepsLabels(Protocol):
         ...
 
 
+HARD_LABEL_PROBABILITY = 0.9
+"""Probability of the class of a pixel that comes without any; the rest is spread evenly over the other classes."""
+
+
+def of_hard_labels(count: int) -> NDArray[np.float32]:
+    """Class probabilities (count, count) of a pixel of each class, where only its class is told."""
+    rest = (1 - HARD_LABEL_PROBABILITY) / max(count - 1, 1)
+    return np.where(np.eye(count, dtype=bool), HARD_LABEL_PROBABILITY, rest).astype(np.float32)
+
+
 LARGEST_SHRINK = 16
 """Probabilities may be this many times smaller than the image."""
 
@@ -91,8 +101,12 @@ def resized_softmax(logits: NDArray[np.float32], size: tuple[int, int]) -> NDArr
     """Class logits (c, h, w), enlarged bilinearly to (height, width), as probabilities (height, width, c)."""
     import cv2
 
-    enlarged = cv2.resize(
-        np.ascontiguousarray(logits.transpose(1, 2, 0)), size[::-1], interpolation=cv2.INTER_LINEAR
-    ).reshape(*size, len(logits))
+    parts = [
+        cv2.resize(np.ascontiguousarray(part.transpose(1, 2, 0)), size[::-1], interpolation=cv2.INTER_LINEAR)
+        for part in (
+            logits[i : i + 64] for i in range(0, len(logits), 64)
+        )  # OpenCV takes 128 channels at most
+    ]
+    enlarged = np.concatenate([part.reshape(*size, -1) for part in parts], axis=2)
     exponentials = np.exp(enlarged - enlarged.max(2, keepdims=True))
     return np.asarray(exponentials / exponentials.sum(2, keepdims=True), np.float32)

@@ -63,6 +63,7 @@ from gnss_sem_map.runs.same_run import digest_of, is_run_of
 from gnss_sem_map.runs.source import Source, absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.segmentation.classes import unknown_classes
 from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
@@ -251,6 +252,8 @@ class Run:
             log = replace(run.drive(), frame=run.frame)  # --origin, or another drive, may have given it
             settings, before, stats = run.settings, run.about, RunStats()
             network = open_segmenter(spec, run.label_set, device, log.calibration.image_sizes)
+            if unknown := unknown_classes(network.class_names, run.label_set):
+                stats.warnings.append(f"{spec}: {unknown}")
             drive = Drive(log, run.trajectory, network, settings)
             with TemporaryDirectory(prefix=".work.", dir=folder) as work:
                 mapped = pipeline.map_drive(

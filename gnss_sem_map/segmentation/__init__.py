@@ -42,7 +42,7 @@ class MissingLabels(DataError):
 
 
 SCHEMES = {
-    "labels": "labels:FOLDER[?ids=train_id|label_id&taxonomy=cityscapes]",
+    "labels": "labels:FOLDER[?ids=train_id|label_id|colour&taxonomy=cityscapes|mapillary|camvid|ade20k]",
     "refinenet": "refinenet:CHECKPOINT[?classes=..&scale=1&shrink=2]",
     "hf": "hf:MODEL_OR_FOLDER[?classes=..&scale=1&shrink=2]",
     "onnx": "onnx:FILE[?classes=..&mean=..&std=..&order=rgb|bgr&pixel_max=1|255&scale=1&shrink=2]",

@@ -10,15 +10,25 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.archives import open_archive
-from gnss_sem_map.files.pictures import read_ids
 from gnss_sem_map.files.untrusted import inside, is_folder, shown
-from gnss_sem_map.labels.label_set import OTHER, UNLABELLED, LabelSet, taxonomy
-from gnss_sem_map.labels.probabilities import LabelImage, check_shape, checked_probabilities, shrink_of
+from gnss_sem_map.labels.label_set import OTHER, LabelSet
+from gnss_sem_map.labels.probabilities import (
+    LabelImage,
+    check_shape,
+    checked_probabilities,
+    of_hard_labels,
+    shrink_of,
+)
 from gnss_sem_map.segmentation import MissingLabels
+from gnss_sem_map.segmentation.classes import check_some_known
+from gnss_sem_map.segmentation.label_images import (
+    Meaning,
+    by_frame,
+    meaning_of,
+    none_usable,
+)
 from gnss_sem_map.sensor_log import Image
 
-HARD_LABEL_PROBABILITY = 0.9
-"""Probability of the class of a label image; the rest is spread evenly over the other classes."""
 MOST_TRIED = 20
 """Number of files, spread over the folder, that are tried before it is refused."""
 
@@ -26,14 +36,14 @@ MOST_NAME_BYTES = 1 << 20
 
 
 class CachedLabels:
-    """The segmenter that reads `<number>.npz` (probabilities) or `<number>.png` (class ids) and no camera image.
+    """The segmenter that reads `<number>.npz` (probabilities) or `<number>.png` (classes) and no camera image.
 
-    An `.npz` holds `probabilities` (h, w, c), uint8 as round(255 p) or floating in 0..1, and `class_names` (c,). A
-    PNG holds one 8-bit id per pixel, named by `ids` of `taxonomy`: the class gets HARD_LABEL_PROBABILITY, every other
-    class an equal share of the rest, and a void pixel no evidence at all. Frame numbers may be padded with zeros to
-    any width. Of several cameras, each has a folder of its name. The classes of the first valid file are expected in
-    all others. Raises ConfigError or DataError for another folder, or if none of several files from the whole folder is
-    valid.
+    An `.npz` holds `probabilities` (h, w, c), uint8 as round(255 p) or floating in 0..1, and `class_names` (c,). Pixels
+    of a PNG are `ids` or colours of `taxonomy` (found out where they are not given, see `meaning_of`): the class gets
+    HARD_LABEL_PROBABILITY, every other class an equal share of the rest, and a void pixel no evidence at all. Frame
+    numbers may be padded with zeros to any width, and be part of a name (`by_frame`). Of several cameras, each has a
+    folder of its name. The classes of the first valid file are expected in all others. Raises ConfigError or DataError
+    for another folder, or if none of several files from the whole folder is valid.
     """
 
     def __init__(
@@ -42,14 +52,19 @@ class CachedLabels:
         label_set: LabelSet,
         sizes: Mapping[str, tuple[int, int]] | None = None,
         ids: str | None = None,
-        taxonomy: str = "cityscapes",
+        taxonomy: str | None = None,
     ) -> None:
         self._folder, self._sizes = folder, sizes or {}
-        self._files, suffix = _label_files(folder, list(self._sizes) or [""])
-        self._evidence: NDArray[np.uint8] | None = None
+        self._files, suffix, told = _label_files(folder, list(self._sizes) or [""], ids)
+        self._meaning: Meaning | None = None
         if suffix == ".png":
-            self._ids, self._unknown, self._evidence = _evidence_of_ids(label_set, taxonomy, ids)
+            where = f"labels {shown(folder)}"
+            kind = ids or (told if taxonomy is None else None)
+            self._meaning = meaning_of(self._some_files(), label_set, taxonomy, kind, where)
             self.class_names: tuple[str, ...] = (*label_set.names, OTHER)
+            count = len(self.class_names)
+            self._evidence = np.zeros((256, count), np.uint8)  # void has none
+            self._evidence[:count] = np.rint(255 * of_hard_labels(count))
         elif ids is not None:
             raise ConfigError(
                 f"labels {folder}: found .npz probabilities, where ids={ids} means nothing; leave it out"
@@ -57,6 +72,12 @@ class CachedLabels:
         else:
             self.class_names = ()
         self._try(label_set)
+
+    @property
+    def remedy(self) -> str:
+        """What to do where they are not what they should be."""
+        make = "make the labels again (gnss-sem-map segment)"
+        return make if self._meaning is None else f"{make}, or say what the ids are (labels:FOLDER?ids=...)"
 
     def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
         """The probabilities of this frame; raises MissingLabels if there are none, DataError for a bad file."""
@@ -67,36 +88,41 @@ class CachedLabels:
         """The result of `__call__`, with a label image not expanded: most of its pixels are never used."""
         path = self._files.get((image.camera, image.number))
         if path is None:
+            numbers = [number for _, number in self._files]
             raise MissingLabels(
-                f"{self._folder}: no labels of frame {image.frame}; {len(self._files)} frames have some"
+                f"{self._folder}: no labels of frame {image.frame}; {len(self._files)} frames have some, from"
+                f" {min(numbers)} to {max(numbers)}"
             )
         return self._read(path, self._sizes.get(image.camera))
 
+    def _some_files(self) -> list[Path]:
+        """At most MOST_TRIED, spread over the folder."""
+        files = list(self._files.values())
+        return files[:: -(-len(files) // MOST_TRIED)]
+
     def _try(self, label_set: LabelSet) -> None:
         """Find a valid file and its classes; raises DataError if none of the tried files is valid."""
-        files = list(self._files.items())
-        tried = files[:: -(-len(files) // MOST_TRIED)]
+        camera_of = {path: camera for (camera, _), path in self._files.items()}
+        tried = self._some_files()
         refused: list[DataError] = []
-        for (camera, _), path in tried:
-            size = self._sizes.get(camera)
+        for path in tried:
+            size = self._sizes.get(camera_of[path])
             try:
-                if self._evidence is not None:
-                    self._read_ids(path, size)
+                if self._meaning is not None:
+                    self._read_codes(self._meaning, path, size)
                 else:
                     self.class_names = read_probabilities(path, size)[1]
-                    label_set.table_from(self.class_names)  # refuses an unknown name
+                    check_some_known(self.class_names, label_set, shown(path))
                 return
             except DataError as error:
                 refused.append(error)
-        if len(files) > 1:
-            raise DataError(f"{refused[0]}; none of {len(tried)} label files that were tried can be used")
-        raise refused[0]
+        raise none_usable(refused)
 
     def _read(
         self, path: Path, size: tuple[int, int] | None
     ) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
-        if self._evidence is not None:
-            return LabelImage(self._read_ids(path, size), self._evidence)
+        if self._meaning is not None:
+            return LabelImage(self._read_codes(self._meaning, path, size), self._evidence)
         probabilities, names = read_probabilities(path, size)
         if names != self.class_names:
             raise DataError(
@@ -104,18 +130,11 @@ class CachedLabels:
             )
         return probabilities
 
-    def _read_ids(self, path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-        import cv2
-
-        ids = read_ids(path)
+    def _read_codes(self, meaning: Meaning, path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
+        codes = meaning.read(path)
         if size is not None:
-            shrink_of(ids.shape, size, str(path))
-        if cv2.LUT(ids, self._unknown.view(np.uint8)).any():  # many times faster than indexing
-            unknown = np.unique(ids[self._unknown[ids]]).tolist()
-            raise DataError(
-                f"{path}: found ids {unknown}, which are no {self._ids}; name their kind with ?ids="
-            )
-        return ids
+            shrink_of(codes.shape, size, str(path))
+        return codes
 
 
 def read_probabilities(
@@ -138,53 +157,31 @@ def read_probabilities(
         return checked_probabilities(stored.read(), len(names), shown(path)), names
 
 
-def _label_files(folder: Path, cameras: Sequence[str]) -> tuple[dict[tuple[str, int], Path], str]:
-    """The files by camera and frame number, and their ending."""
+def _label_files(
+    folder: Path, cameras: Sequence[str], ids: str | None
+) -> tuple[dict[tuple[str, int], Path], str, str | None]:
+    """The files by camera and frame number, their ending, and the kind of ids that their names tell."""
     if not is_folder(folder):
         raise DataError(f"labels {shown(folder)}: no such folder")
     paths = inside(folder)
     found: dict[str, dict[tuple[str, int], Path]] = {".npz": {}, ".png": {}}
+    told: str | None = None
     for camera in cameras:
         of_camera = paths if not camera else inside(folder / camera) if is_folder(folder / camera) else []
         for suffix, files in found.items():
-            files |= {(camera, number): path for number, path in _numbered(of_camera, suffix).items()}
+            numbered, kind = by_frame(of_camera, suffix, ids)
+            files |= {(camera, number): path for number, path in numbered.items()}
+            told = told or kind
     if all(found.values()):
         raise DataError(
             f"labels {shown(folder)}: found both .npz and .png; expected one kind, keep them in two folders"
         )
     for suffix, files in found.items():
         if files:
-            return files, suffix
+            return files, suffix, told
     folders = [shown(path.name) for path in paths if path.is_dir()]
     hint = f"; did you mean one of its folders {folders[:8]}?" if folders else ""
+    others = sorted({path.suffix for path in paths if path.is_file() and path.suffix})
+    hint += f"; found {', '.join(map(shown, others[:8]))} there: save them as PNG" if others else ""
     where = "it" if "" in cameras else f"the folders of the cameras, {', '.join(cameras)}"
     raise DataError(f"labels {shown(folder)}: found no <frame number>.npz or .png in {where}{hint}")
-
-
-def _numbered(paths: list[Path], suffix: str) -> dict[int, Path]:
-    files: dict[int, Path] = {}
-    for path in paths:
-        if path.suffix == suffix and path.stem.isdecimal():
-            if int(path.stem) in files:
-                raise DataError(
-                    f"{shown(path)}: same frame as {files[int(path.stem)].name}; expected one file per frame"
-                )
-            files[int(path.stem)] = path
-    return files
-
-
-def _evidence_of_ids(
-    label_set: LabelSet, name: str, ids: str | None
-) -> tuple[str, NDArray[np.bool_], NDArray[np.uint8]]:
-    """The kind of ids, and of every 8-bit id whether it is unknown (256,) and evidence (256, c + 1) as round(255 p)."""
-    source = taxonomy(name)
-    ids = ids or source.usual_ids
-    if ids not in source.ids:
-        raise ConfigError(f"labels: taxonomy {name!r} has no ids {ids!r}; expected one of {list(source.ids)}")
-    classes = source.lookup(label_set, ids)
-    count = len(label_set.names) + 1
-    rest = (1 - HARD_LABEL_PROBABILITY) / (count - 1)
-    softened = np.where(np.eye(count, dtype=bool), HARD_LABEL_PROBABILITY, rest)
-    evidence = np.zeros((256, count), np.uint8)
-    evidence[classes >= 0] = np.rint(255 * softened[classes[classes >= 0]])
-    return ids, classes < UNLABELLED, evidence

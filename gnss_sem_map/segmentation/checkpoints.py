@@ -20,7 +20,13 @@ from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.backbones import RESNET_BLOCKS
 from gnss_sem_map.segmentation.classes import VOID, named_classes
-from gnss_sem_map.segmentation.networks import NetworkSegmenter, find_device, for_inference, from_logits
+from gnss_sem_map.segmentation.networks import (
+    NetworkSegmenter,
+    find_device,
+    for_inference,
+    from_logits,
+    normalised,
+)
 from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 
@@ -65,7 +71,8 @@ def open_refinenet(
     network = for_inference(network, where)
     as_scale, as_shrink = scale_and_shrink(scale, shrink, str(path), checkpoint.scale)
     kept = [name for name in names if name != VOID]
-    return NetworkSegmenter(from_logits(network, names), kept, where, MEAN, STD, as_scale, as_shrink)
+    run, prepare = from_logits(network, names), normalised(MEAN, STD, where)
+    return NetworkSegmenter(f"refinenet:{path}", run, kept, where, prepare, as_scale, as_shrink)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:

@@ -12,31 +12,51 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 from transformers import (
     MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING,
     AutoConfig,
+    AutoImageProcessor,
     AutoModelForSemanticSegmentation,
     AutoModelForUniversalSegmentation,
     AutoTokenizer,
 )
-from transformers.image_processing_base import ImageProcessingMixin
-from transformers.utils import logging
+from transformers.models.auto.image_processing_auto import (
+    IMAGE_PROCESSOR_MAPPING_NAMES,
+    get_image_processor_class_from_name,
+)
+from transformers.utils import cached_file, logging
 
 from gnss_sem_map.errors import DataError, one_line, program
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.classes import VOID, named_classes
-from gnss_sem_map.segmentation.networks import NetworkSegmenter, Probabilities, find_device, from_logits
-from gnss_sem_map.segmentation.pixels import scale_and_shrink
-from gnss_sem_map.segmentation.refinenet import MEAN, STD
+from gnss_sem_map.segmentation.networks import (
+    NetworkSegmenter,
+    Prepare,
+    Probabilities,
+    find_device,
+    from_logits,
+)
+from gnss_sem_map.segmentation.pixels import STRIDE, scale_and_shrink, whole_strides
 
 MASK_NETWORKS = ("maskformer", "mask2former", "oneformer", "eomt", "eomt_dinov3")
 """Mask networks; all others of the library for semantic segmentation give logits."""
 
-STRIDE = 32
-"""Of the coarsest features; images are stretched to whole multiples of it."""
+SQUARE_NETWORKS = ("eomt", "eomt_dinov3", "dpt", "beit", "data2vec-vision")
+"""They see squares of the size that their config says, and no other shape."""
+
+PROCESSOR_FILES = ("preprocessor_config.json", "processor_config.json")
+
+AS_IT_IS = {
+    "do_resize": False, "do_center_crop": False, "do_pad": False, "do_split_image": False, "class_info_file": None,
+}  # fmt: skip
+"""What an image processor is told: the map needs every pixel, undistorted, and nothing is fetched."""
+
+LOCAL = {"local_files_only": True, "_raise_exceptions_for_missing_entries": False}
 
 TASK = "the task is semantic"
 """Task prompt of OneFormer."""
@@ -48,38 +68,44 @@ def open_huggingface(
 ) -> NetworkSegmenter:  # fmt: skip
     """A network of transformers from a folder, or from the local cache of `hf download MODEL`.
 
-    Mean and standard deviation are those of its image processor (ImageNet's where it has none); its resizing is not
-    used, because it would distort wide images. Class names are its own unless `classes` is given. Raises
+    Pixels are prepared by its image processor (without a file of that, by the one of its kind), but for the resizing,
+    which would distort wide images. Class names are its own unless `classes` is given. Raises
     DataError for a missing model or one of another kind, ConfigError for class names that the class set does not know.
     """
     where = find_device(device)
     as_scale, as_shrink = scale_and_shrink(scale, shrink, f"hf:{model}")
     config, network = _load(model)
     network.to(where).eval()
-    own = [config.id2label[i] for i in range(config.num_labels)]
+    own = [str(config.id2label.get(i, f"LABEL_{i}")) for i in range(config.num_labels)]
     names = named_classes(classes, config.num_labels, label_set, f"hf:{model}", own)
     masks = config.model_type in MASK_NETWORKS
-    run = _stretched(_masks(network, config, names, model, where) if masks else _logits(network, names))
-    mean, std = _normalisation(model)
+    see = _masks(network, config, names, model, where) if masks else _logits(network, names)
+    if config.model_type in SQUARE_NETWORKS:
+        see = _in_windows(see, config.image_size)
+    run = _stretched(_shares(see) if masks else see)
     kept = [name for name in names if name != VOID]
-    return NetworkSegmenter(run, kept, where, mean, std, as_scale, as_shrink)
+    return NetworkSegmenter(f"hf:{model}", run, kept, where, _prepare(model, config), as_scale, as_shrink)
 
 
 def _load(model: str) -> tuple[Any, Any]:
     try:
         with _quiet():
-            config = AutoConfig.from_pretrained(model, local_files_only=True)
+            config = AutoConfig.from_pretrained(model, local_files_only=True, trust_remote_code=False)
             network, report = _kind(config, model).from_pretrained(
                 model, local_files_only=True, output_loading_info=True
             )
     except DataError:
         raise
-    except (OSError, ValueError, RuntimeError) as error:
-        if not Path(model).is_dir():
+    except Exception as error:  # of a file of settings, of one of tensors, or of a package that is not there
+        if Path(model).is_dir() or not isinstance(error, OSError | ValueError):
+            raise DataError(f"hf:{model}: cannot be read ({one_line(error)})") from error
+        if Path(model).exists() or model.startswith((".", "/", "~")) or model.count("/") > 1:
             raise DataError(
-                f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
+                f"hf:{model}: no such folder; expected one with config.json and the weights, or the name of a model"
             ) from None
-        raise DataError(f"hf:{model}: cannot be read ({one_line(error)})") from None
+        raise DataError(
+            f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
+        ) from None
     unset = sorted([*report["missing_keys"], *report["mismatched_keys"]])
     if unset:
         raise DataError(
@@ -133,17 +159,22 @@ def _masks(
         classes = answer.class_queries_logits.softmax(2)[:, :, kept]  # not the last one, which is "no object"
         return torch.einsum("bqc, bqhw -> bchw", classes, masks)
 
-    see = _in_windows(masses, config.image_size) if config.model_type.startswith("eomt") else masses
+    return masses
+
+
+def _shares(masses: Probabilities) -> Probabilities:
+    """Of the masses of all classes, each one's share."""
 
     def probabilities(images: Tensor, size: tuple[int, int]) -> Tensor:
-        mass = see(images, size)
+        mass = masses(images, size)
         return mass / mass.sum(1, keepdim=True).clamp_min(1e-6)
 
     return probabilities
 
 
-def _in_windows(masses: Probabilities, side: int) -> Probabilities:
+def _in_windows(see: Probabilities, image_size: int | list[int]) -> Probabilities:
     """For a network of a fixed, square input: the shorter side is scaled to it, the longer is processed in windows."""
+    side = image_size if isinstance(image_size, int) else image_size[0]
 
     def windowed(images: Tensor, size: tuple[int, int]) -> Tensor:
         height, width = images.shape[2:]
@@ -154,7 +185,7 @@ def _in_windows(masses: Probabilities, side: int) -> Probabilities:
             (top, left) for top in _starts(whole.shape[2], side) for left in _starts(whole.shape[3], side)
         ]
         parts = [
-            masses(whole[:, :, top : top + side, left : left + side], (side, side)) for top, left in corners
+            see(whole[:, :, top : top + side, left : left + side], (side, side)) for top, left in corners
         ]
         total = parts[0].new_zeros(*parts[0].shape[:2], *whole.shape[2:])
         count = parts[0].new_zeros(whole.shape[2:])
@@ -174,7 +205,7 @@ def _starts(length: int, side: int) -> list[int]:
 
 def _stretched(probabilities: Probabilities) -> Probabilities:
     def run(images: Tensor, size: tuple[int, int]) -> Tensor:
-        whole = [max(STRIDE, STRIDE * round(side / STRIDE)) for side in images.shape[2:]]
+        whole = [whole_strides(side) for side in images.shape[2:]]
         return probabilities(interpolate(images, size=whole, mode="bilinear", align_corners=False), size)
 
     return run
@@ -194,11 +225,25 @@ def _task_tokens(model: str, config: Any) -> Tensor:
     return masked
 
 
-def _normalisation(model: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _prepare(model: str, config: Any) -> Prepare:
+    """The image processor of the model, but for its resizing: it knows the order of channels, their range and mean."""
     try:
-        about, _ = ImageProcessingMixin.get_image_processor_dict(model, local_files_only=True)
-    except OSError:
-        return MEAN, STD
-    if not about.get("do_normalize", True):
-        return (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-    return tuple(about.get("image_mean", MEAN)), tuple(about.get("image_std", STD))
+        with _quiet():
+            if any(cached_file(model, name, **LOCAL) for name in PROCESSOR_FILES):
+                processor = AutoImageProcessor.from_pretrained(
+                    model, local_files_only=True, backend="pil", trust_remote_code=False, **AS_IT_IS
+                )
+            else:
+                kind = IMAGE_PROCESSOR_MAPPING_NAMES[config.model_type]["pil"]
+                processor = get_image_processor_class_from_name(kind)(**AS_IT_IS)
+            processor(np.zeros((STRIDE, STRIDE, 3), np.uint8), return_tensors="pt")
+    except Exception as error:  # whatever a file of settings may make of others' code
+        raise DataError(
+            f"hf:{model}: its image processor, as preprocessor_config.json sets it, cannot be used: {one_line(error)}"
+        ) from error
+
+    def prepare(pixels: NDArray[np.uint8]) -> Tensor:
+        seen = processor(list(pixels), return_tensors="pt", input_data_format="channels_last")
+        return torch.as_tensor(seen["pixel_values"], dtype=torch.float32)
+
+    return prepare

@@ -14,39 +14,40 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, one_line
 from gnss_sem_map.memory import reuse_memory
 from gnss_sem_map.segmentation.classes import VOID
-from gnss_sem_map.segmentation.pixels import checked_pixels, scaled
+from gnss_sem_map.segmentation.pixels import checked_pixels, named, scaled
 from gnss_sem_map.sensor_log import Image
 
 Probabilities = Callable[[Tensor, tuple[int, int]], Tensor]
 """Normalised images (b, 3, h, w) and the wanted (height, width) -> class probabilities (b, c, height, width)."""
+
+Prepare = Callable[[NDArray[np.uint8]], Tensor]
+"""RGB pixels (b, h, w, 3) -> images (b, 3, h, w) as the network expects them."""
 
 
 class NetworkSegmenter:
     """Runs a network at `scale` times the image's size; its output has the image's size divided by `shrink`.
 
     The remainder of that division at the right and lower border (less than `shrink` pixels) is not segmented. Raises
-    DataError for an image that is not (h, w, 3) uint8, for probabilities that are not finite, or when the device's
-    memory is full.
+    DataError with the `name` of the network for an image that is not (h, w, 3) uint8, for any error inside the network,
+    for probabilities that are not finite, or when the device's memory is full.
     """
 
     def __init__(
         self,
+        name: str,
         probabilities: Probabilities,
         class_names: Sequence[str],
         device: torch.device,
-        mean: Sequence[float],
-        std: Sequence[float],
+        prepare: Prepare,
         scale: float = 1.0,
         shrink: int = 2,
     ) -> None:
         self.class_names = tuple(class_names)
-        self._probabilities, self._device = probabilities, device
-        self._mean = torch.tensor(mean, device=device).reshape(3, 1, 1)
-        self._std = torch.tensor(std, device=device).reshape(3, 1, 1)
-        self._scale, self._shrink = scale, shrink
+        self._name, self._probabilities, self._device = name, probabilities, device
+        self._prepare, self._scale, self._shrink = prepare, scale, shrink
         # torch prepares every layer anew for each thread that uses a GPU, and a batch of each would fill its memory
         self._gpu_thread = None if device.type == "cpu" else ThreadPoolExecutor(1)
         if self._gpu_thread is None:
@@ -74,23 +75,35 @@ class NetworkSegmenter:
             return [seen for image in images for seen in self.segment_many([image])]
         height, width = (side // self._shrink for side in pixels[0].shape[:2])
         inputs = np.stack([scaled(p, self._shrink, self._scale) for p in pixels])
-        if self._gpu_thread is None:
-            result = self._run(inputs, (height, width))
-        else:
-            result = self._gpu_thread.submit(self._run, inputs, (height, width)).result()
+        where = f"{self._name} on {named(images, pixels[0])}"
+        try:
+            if self._gpu_thread is None:
+                result = self._run(inputs, (height, width))
+            else:
+                result = self._gpu_thread.submit(self._run, inputs, (height, width)).result()
+        except DataError:
+            raise
+        except Exception as error:  # networks are others' code
+            raise DataError(f"{where}: {type(error).__name__} {one_line(error)}") from error
         if not np.isfinite(result).all():
-            numbers = [image.number for image in images]
-            raise DataError(
-                f"images {numbers}: the network's probabilities are not finite; are its weights damaged?"
-            )
+            raise DataError(f"{where}: the network's probabilities are not finite; are its weights damaged?")
         return [np.ascontiguousarray(one) for one in result]
 
     def _run(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
         with torch.inference_mode(), enough_memory(self._device, "fewer images at once, or ?scale=0.5"):
-            batch = torch.from_numpy(pixels).to(self._device).permute(0, 3, 1, 2).float() / 255
-            seen = self._probabilities((batch - self._mean) / self._std, size)
+            seen = self._probabilities(self._prepare(pixels).to(self._device), size)
             result: NDArray[np.float32] = seen.permute(0, 2, 3, 1).float().cpu().numpy()
         return result
+
+
+def normalised(mean: Sequence[float], std: Sequence[float], device: torch.device) -> Prepare:
+    """What makes pixels, 0 to 1, of that mean and standard deviation (3,) to mean 0 and standard deviation 1."""
+    middle, spread = (torch.tensor(values, device=device).reshape(3, 1, 1) for values in (mean, std))
+
+    def prepare(pixels: NDArray[np.uint8]) -> Tensor:
+        return (torch.from_numpy(pixels).to(device).permute(0, 3, 1, 2).float() / 255 - middle) / spread
+
+    return prepare
 
 
 def from_logits(network: Callable[[Tensor], Tensor], class_names: Sequence[str]) -> Probabilities:

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.sensor_log import Image
+
+STRIDE = 32
+"""Of the coarsest features of most networks; images are stretched to whole multiples of it."""
+
+
+def whole_strides(side: int) -> int:
+    """The multiple of STRIDE nearest to a side, in pixels."""
+    return max(STRIDE, STRIDE * round(side / STRIDE))
 
 
 def checked_pixels(image: Image) -> NDArray[np.uint8]:
@@ -20,12 +30,22 @@ def checked_pixels(image: Image) -> NDArray[np.uint8]:
     return pixels
 
 
-def scaled(
-    pixels: NDArray[np.uint8], shrink: int, scale: float, fixed_size: tuple[int, int] | None = None
-) -> NDArray[np.uint8]:
-    """The pixels cut to sides that `shrink` divides, then resized to `scale` times that, rounded up, or `fixed_size`.
+def named(images: Sequence[Image], pixels: NDArray[np.uint8]) -> str:
+    """The images of one size and that size, for messages: a network's errors depend on it."""
+    numbers = ", ".join(str(image.number) for image in images)
+    return f"image {numbers} of {pixels.shape[1]} x {pixels.shape[0]} pixels"
 
-    Takes and gives (h, w, 3); `fixed_size` is (height, width). Raises DataError for an image smaller than `shrink`.
+
+def scaled(
+    pixels: NDArray[np.uint8],
+    shrink: int,
+    scale: float,
+    to_whole: Callable[[int, int], tuple[int, int]] | None = None,
+) -> NDArray[np.uint8]:
+    """The pixels cut to sides that `shrink` divides, then resized to `scale` times that, rounded up.
+
+    Takes and gives (h, w, 3); `to_whole` makes of (height, width) a size that the network takes. Raises DataError for
+    an image smaller than `shrink`.
     """
     import cv2
 
@@ -35,7 +55,8 @@ def scaled(
             f"found an image of {pixels.shape[1]} x {pixels.shape[0]} pixels, expected at least {shrink}"
         )
     cut = np.ascontiguousarray(pixels[:height, :width])
-    wanted = fixed_size or (int(np.ceil(height * scale)), int(np.ceil(width * scale)))
+    wanted = int(np.ceil(height * scale)), int(np.ceil(width * scale))
+    wanted = wanted if to_whole is None else to_whole(*wanted)
     if wanted == (height, width):
         return cut
     method = cv2.INTER_AREA if wanted[0] < height else cv2.INTER_LINEAR

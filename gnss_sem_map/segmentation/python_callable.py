@@ -9,11 +9,11 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, one_line
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import checked_probabilities, shrink_of
 from gnss_sem_map.segmentation.classes import VOID, named_classes
-from gnss_sem_map.segmentation.pixels import checked_pixels
+from gnss_sem_map.segmentation.pixels import checked_pixels, named
 from gnss_sem_map.sensor_log import Image
 
 
@@ -45,7 +45,9 @@ class PythonSegmenter:
         try:
             answer = np.asarray(self._function(pixels))
         except Exception as error:  # the user's function may raise anything
-            raise DataError(f"{where}: {type(error).__name__} {str(error)[:200]}") from error
+            raise DataError(
+                f"{self._where} on {named([image], pixels)}: {type(error).__name__} {one_line(error)}"
+            ) from error
         seen = checked_probabilities(answer, self._count, where)
         shrink_of(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
         return seen if len(self._kept) == self._count else seen[:, :, self._kept]
@@ -58,12 +60,14 @@ def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
     try:
         function = getattr(importlib.import_module(module), name)
     except ModuleNotFoundError as error:
-        raise ConfigError(f"python:{place}: {error}; is its folder on PYTHONPATH?") from None
+        own = f"{module}.".startswith(f"{error.name}.")  # else one that it imports
+        advice = "is its folder on PYTHONPATH?" if own else "it imports that: install it"
+        raise ConfigError(f"python:{place}: {error}; {advice}") from None
     except AttributeError:
         raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
     except Exception as error:  # and so may the import of its module
         raise ConfigError(
-            f"python:{place}: cannot be imported, {type(error).__name__} {str(error)[:200]}"
+            f"python:{place}: cannot be imported, {type(error).__name__} {one_line(error)}"
         ) from error
     if not callable(function):
         raise ConfigError(f"python:{place}: found {type(function).__name__}, expected a callable")

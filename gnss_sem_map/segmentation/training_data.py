@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.files.pictures import read_ids, read_picture
-from gnss_sem_map.labels.label_set import OTHER, UNLABELLED, LabelSet, taxonomy
+from gnss_sem_map.files.pictures import read_picture
+from gnss_sem_map.labels.label_set import OTHER, LabelSet, taxonomy
+from gnss_sem_map.segmentation.label_images import VOID, Meaning, reading
 
-IGNORE = 255
+IGNORE = VOID
 """Label of pixels that are ignored in training."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -45,30 +46,22 @@ class LabelledFolder:
 
 @dataclass(frozen=True, eq=False)
 class LabelledImages:
-    """Pairs of image and label files, and how an id becomes a class."""
+    """Pairs of image and label files, and what the values of these mean."""
 
     pairs: tuple[tuple[Path, Path], ...]
     class_names: tuple[str, ...]
-    class_of_id: NDArray[np.uint8]
-    """(256,): class index, IGNORE for void."""
-    known: NDArray[np.bool_]
-    """(256,): whether the taxonomy has that id."""
+    meaning: Meaning
 
     def read(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """RGB pixels (h, w, 3) and truth (h, w); raises DataError for damaged files, other sizes and unknown ids."""
         image_file, label_file = self.pairs[index]
         pixels = read_picture(image_file, needs_colour=True)
-        ids = read_ids(label_file)
-        if pixels.shape[:2] != ids.shape:
+        classes = self.meaning.read(label_file)
+        if pixels.shape[:2] != classes.shape:
             raise DataError(
-                f"{label_file}: found {ids.shape} pixels, expected {pixels.shape[:2]} as in {image_file.name}"
+                f"{label_file}: found {classes.shape} pixels, expected {pixels.shape[:2]} as in {image_file.name}"
             )
-        used = np.flatnonzero(np.bincount(ids.ravel(), minlength=256))
-        if not self.known[used].all():
-            raise DataError(
-                f"{label_file}: found unknown ids {used[~self.known[used]].tolist()}; are they other ids?"
-            )
-        return pixels, self.class_of_id[ids]
+        return pixels, classes
 
 
 def labelled_images(
@@ -80,15 +73,9 @@ def labelled_images(
     when there are none or an image has no labels, ConfigError for ids that the taxonomy does not have.
     """
     source = taxonomy(taxonomy_name)
-    kind = ids or source.usual_ids
-    if kind not in source.ids:
-        raise ConfigError(
-            f"taxonomy {taxonomy_name!r} has no ids {kind!r}; expected one of {list(source.ids)}"
-        )
-    pairs = tuple(pair for folder in folders for pair in _pairs(folder, kind))
-    classes = source.lookup(label_set, kind)
-    class_of_id = np.where(classes >= 0, classes, IGNORE).astype(np.uint8)
-    return LabelledImages(pairs, (*label_set.names, OTHER), class_of_id, classes >= UNLABELLED)
+    meaning = reading(source, label_set, ids or source.usual_ids)
+    pairs = tuple(pair for folder in folders for pair in _pairs(folder, meaning.kind))
+    return LabelledImages(pairs, (*label_set.names, OTHER), meaning)
 
 
 def _pairs(folder: LabelledFolder, ids: str) -> list[tuple[Path, Path]]:

@@ -153,14 +153,21 @@ def picture(suffix: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     return Reader(file, lambda: read_image(file, None), mutate)
 
 
-def label_image(folder: Path) -> Reader:
-    """An image of class ids."""
-    import cv2
+def label_image(mode: str, folder: Path) -> Reader:
+    """An image of class ids of 8 (L) or 16 bits, by a palette (P), or of colours (RGB)."""
+    from PIL import Image
 
     from gnss_sem_map.segmentation.cached import CachedLabels
 
     folder.mkdir(parents=True)
-    cv2.imwrite(str(folder / "0.png"), np.random.default_rng(0).integers(0, 19, (96, 300), np.uint8))
+    ids = np.random.default_rng(0).integers(0, 4, (96, 300), np.uint8)
+    colours = np.array([(128, 64, 128), (244, 35, 232), (70, 70, 70), (102, 102, 156)], np.uint8)
+    picture = Image.fromarray(
+        colours[ids] if mode == "RGB" else ids.astype(np.uint16) if mode == "I;16" else ids
+    )
+    if mode == "P":
+        picture.putpalette(colours.ravel().tolist())
+    picture.save(folder / "0.png")
     return Reader(
         folder / "0.png", lambda: CachedLabels(folder, label_set.open_label_set(), None), mutations.png
     )
@@ -424,6 +431,23 @@ EXPORT = """Project:     loop
 """
 WEEK, SECONDS = divmod((START_NS + LEAP_NS - GPS_EPOCH_NS) // 10**9, WEEK_NS // 10**9)
 
+
+def image_processor(folder: Path) -> Reader:
+    """The settings of the image processor of a network of transformers."""
+    from transformers import SegformerConfig
+
+    from gnss_sem_map.segmentation.huggingface import _prepare
+
+    folder.mkdir(parents=True)
+    about = {"image_processor_type": "SegformerImageProcessor", "image_mean": [0.5, 0.4, 0.3], "do_rescale": True,
+             "rescale_factor": 0.004, "image_std": [0.2, 0.2, 0.2], "size": {"height": 512, "width": 512}}  # fmt: skip
+    file = folder / "preprocessor_config.json"
+    file.write_text(json.dumps(about, indent=1))
+    SegformerConfig().save_pretrained(folder)
+    pixels = np.zeros((1, 32, 64, 3), np.uint8)
+    return Reader(file, lambda: _prepare(str(folder), SegformerConfig())(pixels), mutations.text)
+
+
 READERS: dict[str, Callable[[Path], Reader]] = {
     "oxts row": functools.partial(kitti, "oxts/data/0000000002.txt", mutations.text),
     "oxts stamps": functools.partial(kitti, "oxts/timestamps.txt", mutations.text),
@@ -447,7 +471,11 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "scan of text": scan_of_text,
     "PNG": functools.partial(picture, ".png", mutations.png),
     "JPEG": functools.partial(picture, ".jpg", mutations.binary),
-    "label PNG": label_image,
+    "label PNG": functools.partial(label_image, "L"),
+    "label PNG of 16 bits": functools.partial(label_image, "I;16"),
+    "label PNG by a palette": functools.partial(label_image, "P"),
+    "label PNG of colours": functools.partial(label_image, "RGB"),
+    "image processor": image_processor,
     "probabilities": probabilities,
     "point labels": point_labels,
     "TUM": tum,

@@ -194,6 +194,23 @@ def test_relabelled_it_says_what_a_run_with_those_labels_says_of_them(
     assert not any("geometry only" in said for said in again.about["warnings"])
 
 
+def test_class_names_that_nobody_knows_are_said_once(small_drive: Street, tmp_path: Path) -> None:
+    labels = shutil.copytree(small_drive.labels, tmp_path / "labels")
+    for path in labels.iterdir():
+        with np.load(path) as content:
+            names = ["blimp" if name == "other" else name for name in content["class_names"].tolist()]
+            np.savez_compressed(path, probabilities=content["probabilities"], class_names=np.array(names))
+    once = run(small_drive.drive, tmp_path / "once", f"labels:{labels}", force=True)
+    again = run(small_drive.drive, tmp_path / "bare", force=True).relabel(
+        f"labels:{labels}", tmp_path / "again"
+    )
+    for made in (once, again):
+        said = [warning for warning in made.about["warnings"] if "blimp" in warning]
+        assert len(said) == 1
+        assert "1 of 6 class names are unknown and count as other: blimp" in said[0]
+    assert files(again.folder / "map") == files(once.folder / "map")
+
+
 def test_it_warns_of_what_the_classifier_leaves_without_a_class_and_of_nothing_else(
     finished: Run, small_drive: Street, tmp_path: Path
 ) -> None:

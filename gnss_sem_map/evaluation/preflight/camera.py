@@ -9,10 +9,13 @@ from gnss_sem_map.evaluation.preflight import camera_matrix, camera_pose, image_
 from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.findings import Finding, Level
 from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.labels.label_set import open_label_set
 
 
 def check(sample: Sample) -> Iterator[Finding]:
     """Every camera that has images; with several, findings name theirs."""
+    if sample.log.cameras:
+        yield from labels.check_names(sample.segmenter, open_label_set(sample.settings.classes))
     for camera in sample.log.cameras:
         for finding in _check(CameraSample(sample, camera)):
             yield replace(finding, check=f"{camera.name}: {finding.check}") if camera.name else finding

@@ -23,10 +23,15 @@ from gnss_sem_map.evaluation.preflight.camera_pose import (
 from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.depth_edges import UNCHANGED, Change, Edges, View, border_strength
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import LabelImage
+from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
+from gnss_sem_map.segmentation.classes import unknown_classes
 
-NAME, PLACE = "labels", "labels against LiDAR"
+NAME, PLACE, NAMES = "labels", "labels against LiDAR", "class names"
+MOST_REFUSED = 0.5
+"""Of the label files looked at; with more of them refused, the map would miss most of its labels."""
 ONE_CLASS = 0.97
 """No camera of a road sees only one class, image after image."""
 LEAST_KNOWN = 0.01
@@ -52,19 +57,33 @@ def check(sample: CameraSample, against_lidar: bool) -> Iterator[Finding]:
         seen.append(classes)
         coarse, fine = border_strength(classes, sample.camera.image_size)
         views.append(View(view.p_map, view.weights, view.stamp, coarse, fine))
-    if not seen and errors:
-        yield amber(
+    refused = [error for error in errors if not isinstance(error, MissingLabels)]
+    if lost := refused or (errors if not seen else []):
+        count = len(seen) + len(lost)
+        yield (red if len(refused) > MOST_REFUSED * count else amber)(
             NAME,
-            f"none of {len(errors)} frames looked at has labels that can be read: {errors[0]}",
-            "labels are of other frames, or damaged",
-            "check the frame numbers in the names of the label files",
+            f"labels of {len(lost)} of {count} frames looked at are refused or missing: {lost[0]}",
+            "label files are damaged, of other frames, or of other classes",
+            segmenter.remedy if refused else "check the frame numbers in the names of the label files",
         )
     if not seen:
         return
-    content = _content(seen, segmenter.class_names)
+    content = _content(seen, segmenter.class_names, segmenter.remedy)
     yield content
     if against_lidar and not content.mistake:
         yield _place(sample, replace(edges, views=tuple(views)))
+
+
+def check_names(segmenter: Segmenter | None, label_set: LabelSet) -> Iterator[Finding]:
+    """The class names of any segmenter: unknown ones are listed, in one finding."""
+    found = None if segmenter is None else unknown_classes(segmenter.class_names, label_set)
+    if found is not None:
+        yield amber(
+            NAMES,
+            found,
+            "the class set does not know them",
+            "name them with ?classes=..., or in the `sources` of the class set file",
+        )
 
 
 def classes_of(labels: NDArray[np.uint8] | NDArray[np.float32] | LabelImage) -> NDArray[np.int64]:
@@ -76,7 +95,7 @@ def classes_of(labels: NDArray[np.uint8] | NDArray[np.float32] | LabelImage) -> 
     return np.where(some.any(axis=2), some.argmax(axis=2), UNKNOWN)
 
 
-def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...]) -> Finding:
+def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...], remedy: str) -> Finding:
     known = np.concatenate([classes[classes != UNKNOWN] for classes in seen])
     share = len(known) / sum(classes.size for classes in seen)
     if share < LEAST_KNOWN:
@@ -84,7 +103,7 @@ def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...]) -> Finding:
             NAME,
             f"{share:.1%} of the pixels of {len(seen)} label files have any class",
             "labels are all zero: they hold no class at all",
-            "make the labels again (gnss-sem-map segment)",
+            remedy,
         )
     counts = np.bincount(known)
     top = int(counts.argmax())
@@ -96,7 +115,7 @@ def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...]) -> Finding:
             NAME,
             found,
             f"labels have one class, {name}, nearly everywhere, the sky as well: all zero, or ids of another kind",
-            "make the labels again, or say what the ids are (labels:FOLDER?ids=...)",
+            remedy,
         )
     return green(NAME, found)
 

@@ -33,11 +33,41 @@ def test_probability_is_neither_lost_nor_made() -> None:
     assert (URBAN.table_from(names).sum(axis=1) == 1).all()
 
 
-def test_an_unknown_class_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(ConfigError, match="did you mean 'vegetation'"):
-        URBAN.table_from(["vegitation"])
+def test_an_unknown_class_is_other_and_listed_with_the_nearest_name() -> None:
+    names = ["road", "vegitation", "blimp", "vegitation"]
+    assert URBAN.table_from(names).argmax(1).tolist() == [0, 5, 5, 5]
+    assert URBAN.unknown(names) == ["vegitation", "blimp"]
+    assert "did you mean 'vegetation'" in URBAN.not_known("vegitation")
     with pytest.raises(ConfigError, match="did you mean 'building'"):
         URBAN.index("buildings")
+
+
+@pytest.mark.parametrize(
+    ("name", "target"),
+    [("road, route", "road"), ("sidewalk, pavement", "sidewalk"), ("building;edifice", "building"), ("bed ", OTHER),
+     ("Traffic Light", OTHER), ("traffic_light", OTHER), ("ROAD", "road"), ("car, auto, automobile", "vehicle"),
+     ("On Rails", "vehicle"), ("on-rails", OTHER), ("Lane_Marking_-_General", "road"), ("Truck_Bus", "vehicle")],
+)  # fmt: skip
+def test_the_spelling_of_a_name_does_not_matter(name: str, target: str) -> None:
+    assert URBAN.unknown([name]) == []
+    assert (*URBAN.names, OTHER)[int(URBAN.table_from([name])[0].argmax())] == target
+
+
+def test_every_name_of_every_taxonomy_is_known_and_goes_to_one_class() -> None:
+    sizes = {
+        "cityscapes": 36,
+        "mapillary": 65,
+        "ade20k": 150,
+        "camvid": 33,
+        "kitti6": 6,
+        "semantic_kitti": 32,
+    }
+    for source, size in sizes.items():
+        names = taxonomy(source).names
+        assert len(names) == size
+        assert URBAN.unknown(names) == []
+        for name in names:
+            assert URBAN.table_from([name]).argmax() == URBAN.of_source(source, name), name
 
 
 def test_train_ids_and_label_ids_of_the_same_class_agree() -> None:
@@ -74,7 +104,9 @@ def test_a_user_s_class_set_is_read_and_checked(tmp_path: Path) -> None:
     # what ships with us for the ids of label images has no colours and codes of a map
     with pytest.raises(ConfigError, match=r"no class set 'cityscapes': expected one of \['urban'\] or"):
         open_label_set("cityscapes")
-    with pytest.raises(ConfigError, match=r"no taxonomy 'urban': expected one of \['camvid', 'cityscapes'"):
+    with pytest.raises(
+        ConfigError, match=r"no taxonomy 'urban': expected one of \['ade20k', 'camvid', 'cityscapes'"
+    ):
         taxonomy("urban")
 
 

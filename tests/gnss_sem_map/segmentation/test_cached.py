@@ -16,6 +16,7 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import MissingLabels, open_segmenter
+from gnss_sem_map.segmentation.classes import unknown_classes
 from gnss_sem_map.sensor_log import Image
 
 URBAN = open_label_set("urban")
@@ -87,7 +88,7 @@ def test_a_train_id_becomes_soft_evidence_for_its_class_and_void_for_none(
 ) -> None:
     folder = tmp_path_factory.mktemp("ids")
     write_png(folder / "0.png", np.array(ids, np.uint8).reshape(2, 3))
-    seen = open_segmenter(f"labels:{folder}", URBAN)(frame(0)).reshape(6, 6)
+    seen = open_segmenter(f"labels:{folder}?ids=train_id", URBAN)(frame(0)).reshape(6, 6)
     target = {
         0: "road",
         1: "sidewalk",
@@ -186,8 +187,11 @@ GOOD = some_probabilities() / np.float32(255)
         (lambda folder: (folder / "0.npz").write_bytes(b""), "damaged"),
         (lambda folder: (folder / "0.npz").write_bytes(b"PK\x03\x04 nonsense"), "damaged"),
         (lambda folder: (folder / "0.png").write_bytes(b"\x89PNG\r\n"), "damaged"),
-        (lambda folder: write_png(folder / "0.png", np.zeros((9, 13, 3), np.uint8)), "not colours"),
-        (lambda folder: write_png(folder / "0.png", np.zeros((9, 13), np.uint16)), "uint16"),
+        (
+            lambda folder: write_png(folder / "0.png", np.full((9, 13, 3), 7, np.uint8)),
+            "found .'#070707'., which are no colour",
+        ),
+        (lambda folder: write_png(folder / "0.png", np.zeros((9, 13, 3), np.uint16)), "uint16"),
         (lambda folder: write_png(folder / "0.png", np.zeros((8, 13), np.uint8)), "13 x 8 pixels"),
         (lambda folder: write_npz(folder / "0.npz", some_probabilities(shape=(5, 6, 6))), "6 x 5 pixels"),
         (lambda folder: None, "no <frame number>"),
@@ -272,13 +276,15 @@ def test_a_wrong_description_says_what_was_expected(tmp_path: Path, spec: str, m
         open_segmenter(spec.format(tmp_path), URBAN)
 
 
-def test_a_class_that_the_map_does_not_know_is_refused_on_opening(tmp_path: Path) -> None:
-    write_npz(
-        tmp_path / "0.npz",
-        some_probabilities(),
-        ("road", "sidewalk", "vehicle", "building", "vegetatoin", "other"),
-    )
-    with pytest.raises(ConfigError, match="vegetation"):
+def test_classes_that_the_map_does_not_know_are_other_but_one_must_be_known(tmp_path: Path) -> None:
+    names = ("road", "sidewalk", "vehicle", "building", "vegetatoin", "other")
+    write_npz(tmp_path / "0.npz", some_probabilities(), names)
+    segment = open_segmenter(f"labels:{tmp_path}", URBAN)
+    said = unknown_classes(segment.class_names, URBAN)
+    assert said == "1 of 6 class names are unknown and count as other: vegetatoin"
+    assert URBAN.table_from(segment.class_names)[4].argmax() == 5
+    write_npz(tmp_path / "0.npz", some_probabilities(), ("cat", "dog", "cow", "hen", "vegetatoin", "other"))
+    with pytest.raises(ConfigError, match=r"none of its 6 class names is one of the map's: \['cat'"):
         open_segmenter(f"labels:{tmp_path}", URBAN)
 
 

@@ -47,7 +47,7 @@ def test_on_another_device_than_the_cpu_one_thread_runs_the_network_whoever_asks
         return torch.ones(len(images), 1, *size)
 
     device = torch.device("meta")  # of torch's own, for shapes without numbers
-    segment = NetworkSegmenter(probabilities, ("road",), device, (0, 0, 0), (1, 1, 1))
+    segment = NetworkSegmenter("net", probabilities, ("road",), device, torch.from_numpy)
     with ThreadPoolExecutor(4) as pool:
         assert all(one.shape == (48, 80, 1) for one in pool.map(segment, IMAGES))
     assert len(runners) == 1

@@ -102,3 +102,25 @@ def test_classes_may_be_those_of_a_taxonomy_and_void_is_dropped(module: str) -> 
     whole = open_segmenter(f"python:{module}:by_colour", URBAN)(camera())
     np.testing.assert_array_equal(segment(camera()), whole[:, :, [0, 2]])
     URBAN.table_from(segment.class_names)  # each is known
+
+
+def test_a_missing_package_is_told_from_a_missing_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "needs_more.py").write_text("import a_package_nobody_has\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        ConfigError, match="No module named 'a_package_nobody_has'; it imports that: install it"
+    ):
+        open_segmenter("python:needs_more:f", URBAN)
+
+
+def test_any_error_inside_is_one_line_with_image_and_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = "def f(pixels):\n    raise KeyError('a\\nb')\nf.class_names = ('road', 'car')\n"
+    (tmp_path / "breaks.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(DataError, match=r"python:breaks:f on image 4 of 13 x 9 pixels: KeyError") as caught:
+        open_segmenter("python:breaks:f", URBAN)(camera())
+    assert "\n" not in str(caught.value)

@@ -295,7 +295,7 @@ def broken(folder: Path, what: str) -> LabelledFolder:
         ("no labels", r"found 2 images, 1 without a PNG .*000001"),
         ("colours", "not colours"),
         ("size", r"found \(48, 95\) pixels"),
-        ("ids", r"000000\.png: found unknown ids \[77\]"),
+        ("ids", r"000000\.png: found ids \[77\]"),
         ("image", r"000000\.png: damaged image"),
         ("grey", r"000000\.png: found uint8 \(48, 96, 1\)"),
         ("deep", "found uint16"),

@@ -253,6 +253,34 @@ def test_images_of_another_size_are_named(town: SensorLog) -> None:
     assert "620 188" in finding.remedy
 
 
+@pytest.mark.parametrize(("damaged", "seen", "level"), [(2, 1, Level.AMBER), (9, 7, Level.RED)])
+def test_label_files_that_are_refused_are_counted(
+    tmp_path: Path, damaged: int, seen: int, level: Level
+) -> None:
+    """The check looks at ten of the twelve frames."""
+    written = street.write(tmp_path)
+    log = open_drive(written.drive)
+    segmenter = CachedLabels(written.labels, open_label_set("urban"), log.calibration.image_sizes)
+    for path in sorted(written.labels.glob("*.npz"))[:damaged]:
+        path.write_bytes(path.read_bytes()[:-30])
+    found = [one for one in camera.check(Sample(log, Settings(), segmenter)) if one.check == "labels"]
+    assert found[0].level is level
+    assert f"labels of {seen} of 10 frames looked at are refused or missing: " in found[0].evidence
+    assert "?ids=" not in found[0].remedy  # probabilities have none
+
+
+def test_unknown_class_names_are_listed_once(small_drive: street.Street) -> None:
+    log = open_drive(small_drive.drive)
+
+    class Network:
+        class_names = ("road", "blimp", "sidewalk", "ufo", "blimp")
+
+    found = [one for one in camera.check(Sample(log, Settings(), Network())) if one.check == "class names"]  # type: ignore[arg-type]
+    assert len(found) == 1
+    assert found[0].level is Level.AMBER
+    assert found[0].evidence == "2 of 5 class names are unknown and count as other: blimp, ufo"
+
+
 @pytest.mark.parametrize("one_class", [False, True])
 def test_labels_that_hold_nothing_are_named(tmp_path: Path, one_class: bool) -> None:
     written = street.write(tmp_path)

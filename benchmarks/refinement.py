@@ -1,13 +1,13 @@
 """What refinement does, on real and simulated drives, and how fast its kernels are beside what others use.
 
-    python benchmarks/refinement.py [kernels] [raw] [semantics] [simulated]
+    python benchmarks/refinement.py [kernels] [raw] [semantics] [simulated] [jam]
         [--data ../shared/data] [--simulated DRIVE ...] [--seeds N --seconds S] [--large] [--run OUT]
 
 prints the figures and writes them into benchmarks/results/refinement.json; parts that were not asked for stay as they
 are there. Removal: share of moving vehicle points removed (DA), of static vehicle points kept (SA_vehicle) and of all
 static points kept (SA), AA = sqrt(SA DA); on real data and with `semantics` the paper's rule beside ours. Simulated:
 what every mover does, how much of it was removed, and how many voxels are left over roads where nothing stands. Both
-also without labels, by free space and tracks alone.
+also without labels, by free space and tracks alone; jams only so.
 Semantics: strict IoU on the points that their own image labels, before and after. Times are CPU time of this process;
 what counts is their ratio.
 """
@@ -33,7 +33,10 @@ from chunks import build_maps
 from numpy.typing import NDArray
 from refinement_kernels import block_by_block, clocked, count_grid_beside_bincount, dbscan_beside_sklearn
 from results_file import keep
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.dynamics.visibility import KeyframeScans
@@ -56,7 +59,7 @@ TABLES = Tables.of(URBAN)
 RAW_0005 = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
 RESULTS = Path(__file__).parent / "results" / "refinement.json"
 AS_IT_RUNS, WITHOUT_LABELS = "as the pipeline runs", "without labels"
-PARTS = ["kernels", "raw", "semantics", "simulated"]
+PARTS = ["kernels", "raw", "semantics", "simulated", "jam"]
 Figures = dict[str, Any]
 GROUND_IDS = (40, 48)
 HIGHEST = 20
@@ -101,6 +104,8 @@ def main() -> None:
     if "semantics" in parts and (options.data / RAW_0005).is_dir():
         report("semantics, SemanticKITTI 00 and 08", on_semantic_kitti(options.data))
     with tempfile.TemporaryDirectory() as folder:
+        if "jam" in parts:
+            report("removal, jams without labels", in_jams(Path(folder), options.seeds or 5))
         drives = [*options.simulated, *simulated(Path(folder), options.seeds, options.seconds)]
         for drive in drives if "simulated" in parts else []:
             report(f"removal, simulated, {drive.name}", on_simulated_drive(drive))
@@ -209,6 +214,37 @@ def simulated(folder: Path, seeds: int, seconds: float) -> list[Path]:
     return [simulate(folder / f"seed_{seed}", seconds, seed) for seed in range(101, 101 + seeds)]
 
 
+def in_jams(folder: Path, seeds: int) -> Figures:
+    """Slow traffic without labels: by the poses that a run finds, and by given ones that are not quite sharp."""
+    from gnss_sem_map.simulation import simulate
+
+    figures: Figures = {}
+    for seed in range(201, 201 + seeds):
+        drive = simulate(folder / f"jam_{seed}", 20.0, seed, jam=True)
+        log = open_drive(drive)
+        assert log.reference is not None
+        for name, trajectory in (
+            (AS_IT_RUNS, estimate_trajectory(log, Settings(), RunStats())[0]),
+            ("poses off by 2 cm and 0.1 deg", with_errors(log.reference, seed)),
+        ):
+            one = Drive(log, trajectory, None, Settings())
+            found = against_truth(one, drive, mapped(one))
+            figures[f"{seed}, {name}"] = found
+            print(seed, name, {key: round(found[key], 4) for key in ("SA", "DA", "SA_vehicle")}, flush=True)
+    return figures
+
+
+def with_errors(exact: Trajectory, seed: int, stddev_m: float = 0.02, stddev_deg: float = 0.1) -> Trajectory:
+    """The poses with errors that change within a second."""
+    rng, scans = np.random.default_rng(seed), 1.0 / float(np.median(np.diff(exact.stamps)))
+    off = gaussian_filter1d(rng.standard_normal((len(exact.stamps), 6)), scans, axis=0)
+    off *= np.repeat([np.radians(stddev_deg), stddev_m], 3) / off.std(axis=0)
+    T = exact.T_map_imu.copy()
+    T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(off[:, :3]).as_matrix()
+    T[:, :3, 3] += off[:, 3:]
+    return Trajectory(exact.stamps, T)
+
+
 def perfectly_seen(folder: Path) -> Drive:
     """A simulated drive with the poses that a run finds, and perfect class images."""
     log = open_drive(folder)
@@ -280,9 +316,9 @@ def what_they_do(folder: Path) -> dict[int, str]:
     """What the mover of every instance number does in this drive: the traffic of its seed, once more."""
     from gnss_sem_map.simulation.drive import prepare
 
-    seed = json.loads((folder / "truth" / "world.json").read_text("utf-8"))["seed"]
+    about = json.loads((folder / "truth" / "world.json").read_text("utf-8"))
     scans = len(list((folder / "velodyne_points" / "data").glob("*.bin")))
-    world = prepare(scans / 10, seed).world
+    world = prepare(scans / 10, about["seed"], jam=about.get("jam", False)).world
     return dict(
         zip(world.instances[len(world.town.things) :].tolist(), (m.name for m in world.movers), strict=True)
     )

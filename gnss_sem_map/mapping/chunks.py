@@ -37,6 +37,8 @@ from gnss_sem_map.voxels.attribute_table import WAITS
 from gnss_sem_map.voxels.attributes import Attributes
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
 
+BLURRED = "scans with blurred poses"
+"""Count of those in which free space is no evidence."""
 WINDOWS = 2
 """Windows of scans in a chunk: with more, fewer scans are processed twice at its ends, and more memory is needed. With
 one, tracks are cut so often that 97.0 % of the moving points of the demo are removed, not 98.6 %."""
@@ -239,6 +241,8 @@ class _Chunk:
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
         keyframes = self._keyframes.keyframes() if decision.is_sharp else None
+        if not decision.is_sharp:
+            self.stats.counts[BLURRED] += len(numbers)
         seen, added = Attributes(*self._all.attributes()), self._all.to_map()
         del self._all  # 60 MB are free while the chunk is saved
         static = added - gone

@@ -18,7 +18,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import writing_to
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
-from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
+from gnss_sem_map.mapping.chunks import BLURRED, chunks_of, map_chunks
 from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
@@ -137,6 +137,18 @@ def _check(drive: Drive, stats: RunStats) -> None:
     if drive.segmenter is not None and drive.log.cameras and not stats.counts["points labelled"]:
         why = _first_reason(stats, "labels")
         stats.warnings.append(f"no point got a label, and {without_images(drive.settings)}{why}")
+
+    if (blurred := stats.counts[BLURRED]) and not any(one.is_too_sparse for one in drive.by_lidar):
+        settings = drive.settings.trajectory
+        is_given = drive.log.given is not None and settings.given_poses == "fixed"
+        cure = "given_poses=measured" if is_given else "lidar_odometry=true"
+        sharper = is_given or not settings.lidar_odometry
+        stats.warnings.append(
+            f"{drive.log.name}: the poses of {blurred} of {stats.counts['scans']} scans blur what stands: what no image"
+            " shows is found to move there only where it goes elsewhere, and free_space clears nothing"
+            + f"; sharper poses: --set trajectory.{cure}"
+            * sharper
+        )
 
 
 def _first_reason(stats: RunStats, what: str) -> str:

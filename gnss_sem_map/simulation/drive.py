@@ -66,6 +66,8 @@ class Simulation:
     """(frames,) the row of `oxts` that belongs to every sweep."""
     changes: list[Change]
     """What came and went since session 0, in the simulation's own axes; see `to_map`."""
+    jam: bool = False
+    """Slow traffic."""
 
     @property
     def name(self) -> str:
@@ -218,7 +220,7 @@ def prepare(
     sync = sweep_rows(oxts_stamps, sweeps.mean(axis=1), rng)
     world = World(town, ego, movers)
     world.remember(_moments(rig, sweeps))
-    return Simulation(seed, session, world, rig, sweeps, oxts_stamps, rows, sync, changes(usual, built))
+    return Simulation(seed, session, world, rig, sweeps, oxts_stamps, rows, sync, changes(usual, built), jam)
 
 
 def _moments(rig: Rig, sweeps: Floats) -> Floats:
@@ -356,6 +358,8 @@ def write_truth(simulation: Simulation, truth: Path) -> None:
         "epoch_ns": simulation.morning_ns + round(simulation.zero_s * 1e9),
         "lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m, "seed": simulation.seed,
     }  # fmt: skip
+    if simulation.jam:
+        about["jam"] = True
     (truth / "world.json").write_text(json.dumps(about, indent=2) + "\n")
     to_map, zero = simulation.to_map, simulation.zero_s
     write_trajectory(truth / "trajectory.tum", simulation.world.ego, simulation.oxts_stamps, zero, to_map)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.special import betaincc
 from gnss_sem_map.dynamics.object_track import ObjectTrack
 from gnss_sem_map.dynamics.own_motion import OwnMotion, motion_of
 from gnss_sem_map.dynamics.range_images import FARTHEST_M
-from gnss_sem_map.dynamics.seen_through import CERTAIN_MISSES_PER_HIT, PERSON_M
+from gnss_sem_map.dynamics.seen_through import PERSON_M
 from gnss_sem_map.dynamics.standing import LARGEST_MISSES_PER_HIT, is_occupied
 from gnss_sem_map.dynamics.tracking import Segment, track
 
@@ -170,11 +170,13 @@ def classify_motion(
     stands = LARGEST_MISSES_PER_HIT if is_sharp else _of_what_stands(listed, own, hits, misses)
     displaced = settings.displaced_misses_per_hit * misses_per_hit
     free = _Free(misses_per_hit, displaced, min(stands, misses_per_hit))
+    of_shown = free if is_sharp else replace(free, of_standing=0.0)
     for members, moved in zip(listed, own, strict=True):
         is_shown = any(segments[n].shown for n in members)
-        whole = _motion_of_track(members, segments, hits, misses, moved, free, counted_in)
-        is_free = misses[members].sum() > CERTAIN_MISSES_PER_HIT * hits[members].sum()
-        if not (is_shown or is_sharp or whole.displaced or is_free):
+        whole = _motion_of_track(
+            members, segments, hits, misses, moved, of_shown if is_shown else free, counted_in
+        )
+        if not (is_shown or is_sharp or whole.displaced):
             continue
         beside = _beside(members, segments, hits, misses)
         if not whole.displaced:  # else it may have come to stand there

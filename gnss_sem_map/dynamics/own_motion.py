@@ -28,10 +28,10 @@ STEADY_SHARE = 0.6
 HIDDEN_SHARE = 0.1
 """What is abeam, and hidden by more than this share of its length at each end, has no place."""
 LARGEST_STEP_SHARE = 0.6
-"""A step that is a larger share of the shift is an error of the clusters: from one scan to the next, and in a long
-track over as many as are smoothed."""
-LONG_SCANS = 15
-"""In a long track, a cluster grows by what stands beside it within some scans, and stays so."""
+GROWTH_SHARE = 0.5
+"""A step from one scan to the next that is a larger share of the shift is an error of the clusters. So is one over as
+many scans as are smoothed, in which the extent changes by more than GROWTH_SHARE of it: a cluster that grows by what
+stands beside it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +81,19 @@ def own_motion(
     unknown += sum(hidden[k] for k in (start, end) if side[k] == 0)
     known = np.maximum(EDGE_STDDEV_M + EDGE_STDDEV_RATIO * ranges[[start, end]], noise)
     stddev = float(np.hypot(*known))
-    span = SMOOTHED if len(centre) >= LONG_SCANS else 1
-    jumps = centre[np.minimum(np.arange(start, end) + span, end)] - centre[start:end]
-    way, largest = abs(np.diff(centre[start : end + 1])).sum(), abs(jumps).max(initial=0.0)
+    steps = np.diff(centre[start : end + 1])
+    way, largest = abs(steps).sum(), abs(steps).max(initial=0.0)
+    largest = max(largest, _growth(centre[start : end + 1], (high - low)[placed][start : end + 1]))
     is_steady = bool(abs(shift) > STEADY_SHARE * way and largest < LARGEST_STEP_SHARE * abs(shift))
     return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady, length)
+
+
+def _growth(centre: NDArray[np.float64], extent: NDArray[np.float64]) -> float:
+    """The largest change of centres (k,) m over some scans in which the extents (k,) m change by as much."""
+    if len(centre) <= SMOOTHED:
+        return 0.0
+    steps, grown = (abs(values[SMOOTHED:] - values[:-SMOOTHED]) for values in (centre, extent))
+    return float(np.where(grown > GROWTH_SHARE * steps, steps, 0.0).max())
 
 
 def scatter(values: NDArray[np.float64]) -> float:

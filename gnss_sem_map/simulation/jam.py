@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from factor_graphs.simulation import Motion, follow
 from gnss_sem_map.simulation import models
@@ -55,11 +56,11 @@ def drive_through_jam(town: Town, seconds: float, day: int) -> tuple[Town, Motio
         at, half = _next(town, model, at, half, rng)
         if at > line + 10.0:
             break
-        crowd.admit("queues ahead", model, CAR_COLOURS[k], _along(own, at, _later(knots, -k * _LATER_S)))
+        crowd.admit("queues ahead", model, CAR_COLOURS[k], _in_queue(own, at, knots, -k))
     at, half = start, 2.2
     for k in range(1, _BEHIND + 1):
         at, half = _next(town, k, at, half, rng, -1.0)
-        crowd.admit("queues behind", k, CAR_COLOURS[k + 4], _along(own, at, _later(knots, k * _LATER_S)))
+        crowd.admit("queues behind", k, CAR_COLOURS[k + 4], _in_queue(own, at, knots, k))
     _queue_beside(crowd, beside, ego.poses([0.5 * seconds])[0, :3, 3], tanker, seconds, rng)
     on_foot(town, crowd, seconds, rng, 1)
     return town, ego, crowd.movers
@@ -79,7 +80,7 @@ def _queue_beside(
         if k == _SHORT_GO:
             knots = _later(_first_metres(_later(knots, k * _LATER_S), _SHORT_GO_M), -k * _LATER_S)
         name = "goes 3.7 m" if k >= _SHORT_GO else "tanker" if k == _TANKER else "queues beside"
-        crowd.admit(name, model, CAR_COLOURS[k], _along(path, at, _later(knots, k * _LATER_S)))
+        crowd.admit(name, model, CAR_COLOURS[k], _in_queue(path, at, knots, k))
 
 
 def _path_beside(town: Town) -> Path:
@@ -127,6 +128,13 @@ def _first_metres(knots: Floats, metres: float) -> Floats:
     way = np.sum(np.diff(goes[:, 0]) * (goes[1:, 1] + goes[:-1, 1]) / 2)
     goes[:, 1] *= metres / way
     return np.concatenate([[(-60.0, 0.0)], goes, [(knots[-1, 0], 0.0)]])
+
+
+def _in_queue(path: Path, at: float, knots: Floats, place: int) -> Motion:
+    """The motion of the vehicle of this place behind the first, which would stand at `at` m if all stood."""
+    mine = _later(knots, place * _LATER_S)
+    ways = [float(PchipInterpolator(*some.T).integrate(some[0, 0], -EARLY_S)) for some in (mine, knots)]
+    return _along(path, at + ways[0] - ways[1], mine)
 
 
 def _along(path: Path, start: float, knots: Floats, lift: float = 0.0) -> Motion:

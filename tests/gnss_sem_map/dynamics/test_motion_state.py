@@ -48,7 +48,7 @@ def test_a_wall_that_is_never_seen_through_leaves_the_track_of_a_walker():
 def test_what_is_beside_something_that_moved_is_in_time_order():
     """A person whose segments are too large in two scans, and are never seen through in two earlier ones."""
     large, occupied = (6, 8), (1, 3)
-    segments = [segment(scan, 0.12 * scan, 5.0 if scan in large else 0.5) for scan in range(12)]
+    segments = [segment(scan, 0.02 * scan, 5.0 if scan in large else 0.5) for scan in range(12)]
     hits = np.where(np.isin(np.arange(12), [*large, *occupied]), 2000.0, 100.0)
     misses = np.where(np.isin(np.arange(12), [*large, *occupied]), 0.0, 5000.0)
     objects = classify_motion(segments, hits, misses, MotionSettings(), is_sharp=True)

@@ -139,6 +139,26 @@ def test_whatever_moves_between_parked_cars_goes_and_they_stay(name, mover):
     assert mover_seen.reason
 
 
+TANKER = (15.0, 2.5, 3.5)
+
+
+def in_queue(number, gap_m=2.5, length=TANKER[0]):
+    """The vehicle of this place in a queue that goes, waits and goes again: each fills the place of the one before."""
+    goes, late = [(0.5, 2.5), (4.0, 6.0)], 1.1 * number
+    x = -number * (length + gap_m)
+    return lambda t: (x + sum(1.8 * (np.clip(t, a + late, b + late) - a - late) for a, b in goes), -3.4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "passes_us"), [(CAR, [0, 1, 2]), (TANKER, [1])])
+def test_a_queue_beside_goes_though_its_places_are_never_free_for_long(size, passes_us):
+    queue = [in_queue(k, length=size[0]) for k in (-1, 0, 1)]
+    share, others, _ = drive([parked(-8, 5.5), parked(8, 5.5), *queue], 80, 0.4, view_deg=0.0, size=size)
+    np.testing.assert_array_equal(share[:2], 0)
+    assert (share[2:][passes_us] > 0.95).all(), share
+    assert others < 3e-3
+
+
 @pytest.mark.slow
 def test_an_overtaken_car_is_followed_around_after_the_camera_lost_it():
     share, others, _ = drive([*ROW, going(10, -3.5, 2.0)], view_deg=80.0)

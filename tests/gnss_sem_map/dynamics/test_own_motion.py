@@ -1,5 +1,7 @@
 """Motion of a track against the hypothesis that it stands: a box in the plane, seen exactly as far as it faces us."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -74,6 +76,37 @@ def test_a_car_that_turns_is_displaced():
 
     parts = [seen(k, np.array(turning(0.1 * k)), 0.04 * k, np.array([-15.0, 4.0])) for k in range(40)]
     assert motion_of(parts).is_moving
+
+
+def test_a_cluster_that_grows_by_what_stands_beside_it_does_not_move():
+    """Over three scans, as the view opens: its end is elsewhere then, and it stays so."""
+    parts = track(lambda t: (0.0, 0.0), lambda t: (-15.0, 3.0))
+    longer = np.arange(0.0, 3.6, 0.2)
+    for k, one in enumerate(parts[20:]):
+        beside = np.column_stack([-LENGTH / 2 - longer[: 6 * (k + 1)], np.full(min(6 * (k + 1), 18), 0.5)])
+        outline = np.vstack([one.outline(), beside])
+        parts[20 + k] = replace(one, outline=outline.copy, centroid=outline.mean(axis=0))
+    moved = motion_of(parts)
+    assert moved is None or not moved.is_moving
+
+
+def test_what_is_abeam_and_hidden_at_both_ends_has_no_place():
+    """A lorry of 15 m that passes, of which for a while some metres beside the LiDAR are seen only."""
+    lorry = np.column_stack([np.linspace(-7.5, 7.5, 76), np.full(76, -1.2)])
+
+    def passing(hidden):
+        parts = []
+        for k in range(60):
+            outline, lidar = lorry + np.array([20.0 - 0.6 * k, 5.0]), np.array([0.0, 2.0])
+            if hidden and 25 <= k < 36:
+                outline = outline[abs(outline[:, 0]) < 2.0]
+            centroid = outline.mean(axis=0)
+            parts.append(Segment(k, 0.1 * k, centroid, len(outline), True, False, outline.copy, lidar))
+        return motion_of(parts)
+
+    assert passing(False).is_moving
+    assert passing(True).is_moving
+    assert passing(True).shift_m == pytest.approx(passing(False).shift_m, abs=0.5)
 
 
 def test_a_jump_from_one_object_to_another_is_no_motion():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gnss_sem_map.dynamics.pose_sharpness import are_sharp
+from gnss_sem_map.dynamics.pose_sharpness import are_sharp, stand_still
 
 
 def told_by(counts):
@@ -52,3 +52,11 @@ def test_a_voxel_counts_as_often_as_scans_have_it():
     of_each = [np.array([place], np.int32) for place in range(60)]
     assert are_sharp(counts, [*of_each[:-1], np.array([59, 60], np.int32)])
     assert not are_sharp(counts, [np.append(place, np.int32(60)) for place in of_each])
+
+
+def test_segments_that_stand_tell_sharp_poses_in_a_queue_of_traffic():
+    stands, moves = np.array([[400.0], [0.5]]), np.array([[300.0], [200.0]])
+    assert stand_still(np.repeat(np.hstack([stands, moves]), [70, 30], axis=1))
+    assert not stand_still(np.repeat(np.hstack([stands, moves]), [50, 50], axis=1))
+    assert not stand_still(np.repeat([[400.0], [4.0]], 50, axis=1))  # blurred: all are seen through a little
+    assert not stand_still(np.zeros((2, 5)))

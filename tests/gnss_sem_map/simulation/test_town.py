@@ -150,3 +150,35 @@ def test_movers_follow_the_same_streets_when_the_drive_is_longer() -> None:
     short, long = prepare(3.0, 0), prepare(60.0, 0)
     stamps = np.arange(0.0, 3.0, 0.1)
     np.testing.assert_allclose(short.world.ego.poses(stamps), long.world.ego.poses(stamps), atol=1e-6)
+
+
+@pytest.fixture(scope="module", params=SEEDS)
+def jam(request: pytest.FixtureRequest) -> Simulation:
+    return prepare(20.0, request.param, jam=True)
+
+
+def test_vehicles_in_a_jam_creep_stop_and_keep_apart(jam: Simulation) -> None:
+    world, stamps = jam.world, np.arange(0.0, 20.0, 0.25)
+    speed = np.linalg.norm(world.ego.velocities(stamps), axis=1)
+    assert (speed < 1e-6).any()
+    assert 0.5 < speed.max() < 2.8
+    vehicles = [mover for mover in world.movers if mover.name not in ("walks", "crosses on foot")]
+    assert {"queues ahead", "queues behind", "tanker", "goes 3.7 m"} <= {mover.name for mover in vehicles}
+    halves = np.array([world.town.models[mover.model].bounds[3] for mover in vehicles] + [2.0])
+    T = np.array([mover.motion.poses(stamps) for mover in vehicles] + [world.ego.poses(stamps)])
+    for a in range(len(T)):
+        off = T[a + 1 :, :, :2, 3] - T[a, :, :2, 3]
+        ahead = abs(np.einsum("vti,ti->vt", off, T[a, :, :2, 0]))
+        aside = abs(np.einsum("vti,ti->vt", off, T[a, :, :2, 1]))
+        assert ((ahead > halves[a] + halves[a + 1 :, None]) | (aside > 2.3)).all()
+    goes = next(mover for mover in vehicles if mover.name == "goes 3.7 m").motion.poses(stamps)[:, :2, 3]
+    assert np.linalg.norm(np.diff(goes, axis=0), axis=1).sum() == pytest.approx(3.7, abs=0.3)
+
+
+def test_a_tanker_passes_beside_the_recording_vehicle_in_a_jam(jam: Simulation) -> None:
+    tanker = next(mover for mover in jam.world.movers if mover.name == "tanker")
+    bounds = jam.world.town.models[tanker.model].bounds
+    assert bounds[3] - bounds[0] > 15
+    stamps = np.arange(0.0, 20.0, 0.5)
+    off = tanker.motion.poses(stamps)[:, :2, 3] - jam.world.ego.poses(stamps)[:, :2, 3]
+    assert np.linalg.norm(off, axis=1).min() < 8.0

@@ -83,7 +83,9 @@ class _Held:
         settings, keyframes = problem.settings, problem.intervals.keyframes
         R_map_imu = np.swapaxes(self.motion.R_imu_map, 1, 2)
         density = problem.noise.gyroscope_noise_density * fit.inflation
-        rests = resting(stands, R_map_imu, keyframes, density)
+        rests = resting(stands, R_map_imu, keyframes, density) & (
+            not problem.is_bound
+        )  # LiDAR odometry knows better
         still = settings.standing_stddev_mps or 1.0
         factors: list[gtsam.NonlinearFactor] = [
             *zero_velocity_factors(stands, still),

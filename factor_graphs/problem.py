@@ -268,8 +268,11 @@ def optimise(
     relative_kernel = RELATIVE_LOSSES[loss]
     for between in relative_pose_factors(problem.relative, problem.relative_at, relative_kernel):
         graph.add(between)
+    still = []
     for constraint in constraints:
         graph.add(constraint)
+        if isinstance(constraint, gtsam.BetweenFactorPose3):
+            still.append(constraint)
     values, iterations = _minimise(problem, graph, start, tolerance)
     squares = _squares(problem, values)
     relative_squares = _relative_squares(problem, values)
@@ -285,7 +288,12 @@ def optimise(
         weights=_weights(kernel, squares),
         relative_squares=relative_squares,
         relative_weights=_weights(relative_kernel, relative_squares),
-        chi2_per_dof=_chi2_per_dof(2 * motion.error(values), squares, relative_squares),
+        chi2_per_dof=_chi2_per_dof(
+            2 * motion.error(values) + sum(2 * one.error(values) for one in still),
+            squares,
+            relative_squares,
+            3 * len(still),
+        ),
     )
 
 
@@ -293,11 +301,17 @@ def _weights(kernel: gtsam.noiseModel.mEstimator.Base | None, squares: Array) ->
     return np.array([1.0 if kernel is None else kernel.weight(r) for r in np.sqrt(squares)])  # type: ignore[attr-defined]
 
 
-def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> float:
-    """About 1 when all standard deviations are honest; measurements that do not fit are left out."""
+def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array, known: int) -> float:
+    """About 1 when all standard deviations are honest; measurements that do not fit are left out.
+
+    `motion` is of the IMU and of what holds at rest, where so many angular rates are `known`: the gyroscope's noise is
+    seen there.
+    """
     good, relative_good = squares < GATE, relative_squares < RELATIVE_GATE
     total = motion + squares[good].sum() + relative_squares[relative_good].sum()
-    return float(total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum(), GOOD_MEAN))
+    return float(
+        total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum() + known, GOOD_MEAN)
+    )
 
 
 def _minimise(

@@ -2,6 +2,8 @@
 
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -48,6 +50,21 @@ def counted(number: int, one: str, many: str = "") -> str:
 def one_line(error: Exception, most: int = 200) -> str:
     """The message of another library's error, for a message of ours: at most so many characters, in one line."""
     return " ".join(str(error).split())[:most] or type(error).__name__
+
+
+@contextmanager
+def errors_of_others(before: str, after: str = "", named: bool = False) -> Iterator[None]:
+    """Make a DataError of one line of whatever the code of others raises: a network may raise anything.
+
+    Its message, with the name of its kind where `named`, stands between `before` and `after`. Errors of ours pass.
+    """
+    try:
+        yield
+    except SemMapError:
+        raise
+    except Exception as error:
+        kind = f"{type(error).__name__} " if named else ""
+        raise DataError(f"{before}{kind}{one_line(error)}{after}") from error
 
 
 def how_to_install(extra: str) -> str:

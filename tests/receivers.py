@@ -17,7 +17,8 @@ DRIVE_NS = (START_NS, START_NS + 60 * 10**9)
 
 
 def read(path: Path, drive_ns: tuple[int, int] | None = DRIVE_NS, **about: object) -> FileFixes:
-    return read_gnss_file(GnssFile(path=path.name, **about), path.parent, START_NS, drive_ns)  # type: ignore[arg-type]
+    about_it = GnssFile.model_validate({"path": path.name, **about})
+    return read_gnss_file(about_it, path.parent, START_NS, drive_ns)
 
 
 def moment(ns: int) -> datetime.datetime:

@@ -31,7 +31,7 @@ from transformers.models.auto.image_processing_auto import (
 )
 from transformers.utils import cached_file, logging
 
-from gnss_sem_map.errors import DataError, one_line, program
+from gnss_sem_map.errors import DataError, errors_of_others, program
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.networks import (
@@ -84,28 +84,28 @@ def open_huggingface(
         see = _in_windows(see, config.image_size)
     run = _stretched(_shares(see) if masks else see)
     kept = [name for name in names if name != VOID]
-    return NetworkSegmenter(f"hf:{model}", run, kept, where, _prepare(model, config), as_scale, as_shrink)
+    return NetworkSegmenter(f"hf:{model}", run, kept, where, preparation(model, config), as_scale, as_shrink)
 
 
 def _load(model: str) -> tuple[Any, Any]:
-    try:
-        with _quiet():
+    is_folder = Path(model).is_dir()
+    is_path = Path(model).exists() or model.startswith((".", "/", "~")) or model.count("/") > 1
+    if is_path and not is_folder:
+        raise DataError(
+            f"hf:{model}: no such folder; expected one with config.json and the weights, or the name of a model"
+        )
+    with _quiet(), errors_of_others(f"hf:{model}: cannot be read (", ")"):
+        try:
             config = AutoConfig.from_pretrained(model, local_files_only=True, trust_remote_code=False)
             network, report = _kind(config, model).from_pretrained(
                 model, local_files_only=True, output_loading_info=True
             )
-    except DataError:
-        raise
-    except Exception as error:  # of a file of settings, of one of tensors, or of a package that is not there
-        if Path(model).is_dir() or not isinstance(error, OSError | ValueError):
-            raise DataError(f"hf:{model}: cannot be read ({one_line(error)})") from error
-        if Path(model).exists() or model.startswith((".", "/", "~")) or model.count("/") > 1:
+        except OSError:
+            if is_folder:
+                raise
             raise DataError(
-                f"hf:{model}: no such folder; expected one with config.json and the weights, or the name of a model"
+                f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
             ) from None
-        raise DataError(
-            f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
-        ) from None
     unset = sorted([*report["missing_keys"], *report["mismatched_keys"]])
     if unset:
         raise DataError(
@@ -225,22 +225,21 @@ def _task_tokens(model: str, config: Any) -> Tensor:
     return masked
 
 
-def _prepare(model: str, config: Any) -> Prepare:
-    """The image processor of the model, but for its resizing: it knows the order of channels, their range and mean."""
-    try:
-        with _quiet():
-            if any(cached_file(model, name, **LOCAL) for name in PROCESSOR_FILES):
-                processor = AutoImageProcessor.from_pretrained(
-                    model, local_files_only=True, backend="pil", trust_remote_code=False, **AS_IT_IS
-                )
-            else:
-                kind = IMAGE_PROCESSOR_MAPPING_NAMES[config.model_type]["pil"]
-                processor = get_image_processor_class_from_name(kind)(**AS_IT_IS)
-            processor(np.zeros((STRIDE, STRIDE, 3), np.uint8), return_tensors="pt")
-    except Exception as error:  # whatever a file of settings may make of others' code
-        raise DataError(
-            f"hf:{model}: its image processor, as preprocessor_config.json sets it, cannot be used: {one_line(error)}"
-        ) from error
+def preparation(model: str, config: Any) -> Prepare:
+    """The image processor of the model, but for its resizing: it knows the order of channels, their range and mean.
+
+    Raises DataError where its file makes none.
+    """
+    broken = f"hf:{model}: its image processor, as preprocessor_config.json sets it, cannot be used: "
+    with _quiet(), errors_of_others(broken):
+        if any(cached_file(model, name, **LOCAL) for name in PROCESSOR_FILES):
+            processor = AutoImageProcessor.from_pretrained(
+                model, local_files_only=True, backend="pil", trust_remote_code=False, **AS_IT_IS
+            )
+        else:
+            kind = IMAGE_PROCESSOR_MAPPING_NAMES[config.model_type]["pil"]
+            processor = get_image_processor_class_from_name(kind)(**AS_IT_IS)
+        processor(np.zeros((STRIDE, STRIDE, 3), np.uint8), return_tensors="pt")
 
     def prepare(pixels: NDArray[np.uint8]) -> Tensor:
         seen = processor(list(pixels), return_tensors="pt", input_data_format="channels_last")

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from gnss_sem_map.errors import ConfigError, DataError, one_line
+from gnss_sem_map.errors import ConfigError, DataError, errors_of_others
 from gnss_sem_map.memory import reuse_memory
 from gnss_sem_map.segmentation.classes import VOID
 from gnss_sem_map.segmentation.pixels import checked_pixels, named, scaled
@@ -76,15 +76,11 @@ class NetworkSegmenter:
         height, width = (side // self._shrink for side in pixels[0].shape[:2])
         inputs = np.stack([scaled(p, self._shrink, self._scale) for p in pixels])
         where = f"{self._name} on {named(images, pixels[0])}"
-        try:
+        with errors_of_others(f"{where}: ", named=True):
             if self._gpu_thread is None:
                 result = self._run(inputs, (height, width))
             else:
                 result = self._gpu_thread.submit(self._run, inputs, (height, width)).result()
-        except DataError:
-            raise
-        except Exception as error:  # networks are others' code
-            raise DataError(f"{where}: {type(error).__name__} {one_line(error)}") from error
         if not np.isfinite(result).all():
             raise DataError(f"{where}: the network's probabilities are not finite; are its weights damaged?")
         return [np.ascontiguousarray(one) for one in result]

@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError, one_line
+from gnss_sem_map.errors import ConfigError, DataError, errors_of_others
 from gnss_sem_map.files.untrusted import is_file, open_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import of_hard_labels, resized_softmax
@@ -84,10 +84,8 @@ class OnnxSegmenter:
         seen: NDArray[Any] = scaled(pixels, self._shrink, self._scale, self._input.whole)[:, :, self._order]
         if self._input.dtype != np.uint8:
             seen = (seen / self._unit - self._mean) / self._std
-        try:
+        with errors_of_others(f"{where}: "):
             answer = self._session.run([self._output], self._input.feed(seen))[0]
-        except Exception as error:  # of any of its providers
-            raise DataError(f"{where}: {one_line(error)}") from error
         if not np.isfinite(answer).all():
             raise DataError(f"{where}: logits are not finite; is the normalisation right?")
         if self._axis is None:
@@ -153,10 +151,8 @@ def _open_session(path: Path, device: str) -> Any:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads do not spin
-    try:
+    with errors_of_others(f"onnx {shown(path)}: cannot be read (", "); export it again"):
         return onnxruntime.InferenceSession(path, options, available)
-    except Exception as error:  # of any of its providers
-        raise DataError(f"onnx {shown(path)}: cannot be read ({one_line(error)}); export it again") from error
 
 
 def _probed(session: Any, path: Path, told: int) -> tuple[_Input, str, int | None, int | None]:
@@ -166,12 +162,8 @@ def _probed(session: Any, path: Path, told: int) -> tuple[_Input, str, int | Non
     """
     port = _input_of(session, path)
     size = port.whole(*PROBE)
-    try:
+    with errors_of_others(f"onnx:{path} on a grey image of {size[1]} x {size[0]} pixels: "):
         answers = session.run(None, port.feed(np.full((*size, 3), 0.5)))
-    except Exception as error:  # of any of its providers
-        raise DataError(
-            f"onnx:{path} on a grey image of {size[1]} x {size[0]} pixels: {one_line(error)}"
-        ) from error
     outputs = [(output.name, answer) for output, answer in zip(session.get_outputs(), answers, strict=True)]
     for name, answer in outputs:
         if answer.ndim == 4 and answer.dtype.kind == "f" and 1 not in (answer.shape[1], answer.shape[3]):

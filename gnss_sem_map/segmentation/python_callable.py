@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError, one_line
+from gnss_sem_map.errors import ConfigError, errors_of_others, one_line
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import checked_probabilities, shrink_of
 from gnss_sem_map.segmentation.classes import VOID, named_classes
@@ -42,12 +42,8 @@ class PythonSegmenter:
         """Class probabilities (h, w, c) of one image."""
         pixels = checked_pixels(image)
         where = f"{self._where} on image {image.number}"
-        try:
+        with errors_of_others(f"{self._where} on {named([image], pixels)}: ", named=True):
             answer = np.asarray(self._function(pixels))
-        except Exception as error:  # the user's function may raise anything
-            raise DataError(
-                f"{self._where} on {named([image], pixels)}: {type(error).__name__} {one_line(error)}"
-            ) from error
         seen = checked_probabilities(answer, self._count, where)
         shrink_of(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
         return seen if len(self._kept) == self._count else seen[:, :, self._kept]

@@ -436,7 +436,7 @@ def image_processor(folder: Path) -> Reader:
     """The settings of the image processor of a network of transformers."""
     from transformers import SegformerConfig
 
-    from gnss_sem_map.segmentation.huggingface import _prepare
+    from gnss_sem_map.segmentation.huggingface import preparation
 
     folder.mkdir(parents=True)
     about = {"image_processor_type": "SegformerImageProcessor", "image_mean": [0.5, 0.4, 0.3], "do_rescale": True,
@@ -445,7 +445,7 @@ def image_processor(folder: Path) -> Reader:
     file.write_text(json.dumps(about, indent=1))
     SegformerConfig().save_pretrained(folder)
     pixels = np.zeros((1, 32, 64, 3), np.uint8)
-    return Reader(file, lambda: _prepare(str(folder), SegformerConfig())(pixels), mutations.text)
+    return Reader(file, lambda: preparation(str(folder), SegformerConfig())(pixels), mutations.text)
 
 
 READERS: dict[str, Callable[[Path], Reader]] = {

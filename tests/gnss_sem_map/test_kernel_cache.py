@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from declared import ROOT, absent
 
 import gnss_sem_map
 from gnss_sem_map.files.kernel_cache import PREFIX
@@ -50,7 +51,7 @@ def start(tmp_path: Path) -> Start:
         subprocess.run(["chmod", "-R", "a-w", str(package)], check=True)
         there = subprocess.run([*prefix, "touch", str(package / "x")], capture_output=True, check=False)
         if there.returncode == 0:
-            pytest.skip("this machine does not let root drop its rights")
+            absent(ROOT, "root cannot drop its rights here")
         return subprocess.run(
             [*prefix, sys.executable, *command], env=environment | {"HOME": NOWHERE} | more,
             cwd=tmp_path, capture_output=True, text=True, check=False,

@@ -112,9 +112,9 @@ def _ends(messages: Messages) -> tuple[NDArray[np.int64], NDArray[np.bool_], lis
     return messages.received_ns, is_end, []
 
 
-def _attitude(message: object, topic: str) -> AttitudePrior:
+def _attitude(message: Any, topic: str) -> AttitudePrior:
     """The orientation of the first message: body to east, north, up (REP 145), with its covariance."""
-    q, variances = message.orientation, np.asarray(message.orientation_covariance)[[0, 4, 8]]  # type: ignore[attr-defined]
+    q, variances = message.orientation, np.asarray(message.orientation_covariance)[[0, 4, 8]]
     quaternion = np.array([q.x, q.y, q.z, q.w])
     if not (variances > 0).all() or not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
         raise DataError(

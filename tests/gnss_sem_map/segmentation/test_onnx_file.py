@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from gnss_sem_map.errors import ConfigError, DataError  # noqa: E402
 from gnss_sem_map.labels.label_set import open_label_set  # noqa: E402
 from gnss_sem_map.segmentation import open_segmenter  # noqa: E402
 from gnss_sem_map.segmentation.checkpoints import write_network  # noqa: E402
+from gnss_sem_map.segmentation.onnx_file import PROBE  # noqa: E402
 from gnss_sem_map.segmentation.refinenet import LightWeightRefineNet  # noqa: E402
 from gnss_sem_map.sensor_log import Image  # noqa: E402
 
@@ -85,12 +85,21 @@ def save(
     if kind == "ids and logits":
         nodes.append(helper.make_node("ArgMax", ["y"], ["ids"], axis=1, keepdims=0))
         outputs.insert(0, helper.make_tensor_value_info("ids", TensorProto.INT64, None))
+    if kind == "one size inside":
+        nodes[2:3] = [
+            helper.make_node("Conv", ["x", "k"], ["z"]),
+            helper.make_node("Add", ["z", "noise"], ["y"]),
+        ]
     if kind == "two inputs":
         inputs.append(helper.make_tensor_value_info("z", TensorProto.FLOAT, [1]))
     if kind == "no image":
         nodes.append(helper.make_node("ReduceMean", ["y"], ["mean"], keepdims=0, axes=[1, 2, 3]))
         outputs = [helper.make_tensor_value_info("mean", TensorProto.FLOAT, None)]
-    graph = helper.make_graph(nodes, "net", inputs, outputs, [kernel])
+    constants = [kernel]
+    if kind == "one size inside":
+        shape = (1, count, *PROBE)
+        constants.append(helper.make_tensor("noise", TensorProto.FLOAT, shape, np.zeros(np.prod(shape))))
+    graph = helper.make_graph(nodes, "net", inputs, outputs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     onnx.save(model, str(path))
     return path
@@ -260,9 +269,9 @@ def test_another_layout_is_refused_on_opening(tmp_path: Path, kind: str, message
 
 
 def test_an_error_inside_names_network_image_and_size(tmp_path: Path) -> None:
-    path = save(tmp_path / "net.onnx", WEIGHTS)
-    segment = open_segmenter(f"onnx:{path}", URBAN, "cpu")
-    segment._input = replace(segment._input, last=True)  # type: ignore[attr-defined]
+    """It adds a plane of the size that it is tried with on opening, and no other image has."""
+    path = save(tmp_path / "net.onnx", WEIGHTS, kind="one size inside")
+    segment = open_segmenter(f"onnx:{path}?classes=kitti6&shrink=1", URBAN, "cpu")
     with pytest.raises(DataError, match=rf"onnx:{path} on image 0 of 64 x 32 pixels: ") as caught:
         segment(camera())
     assert "\n" not in str(caught.value)

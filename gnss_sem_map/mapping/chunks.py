@@ -241,7 +241,7 @@ class _Chunk:
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
         keyframes = self._keyframes.keyframes() if decision.is_sharp else None
-        if not decision.is_sharp:
+        if numbers and not decision.is_sharp:
             self.stats.counts[BLURRED] += len(numbers)
         seen, added = Attributes(*self._all.attributes()), self._all.to_map()
         del self._all  # 60 MB are free while the chunk is saved

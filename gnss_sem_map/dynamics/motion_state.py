@@ -32,6 +32,8 @@ STANDING_MISSES_PER_HIT = 0.15
 STANDING_SHARE, STANDING_MARGIN = 0.8, 3.0
 """With blurred poses, what stands has at most so many times the misses per hit that this share of the tracks that go
 nowhere have at most: the rest may be of what moves."""
+WIDEST_M = 3.5
+"""Wider than a vehicle, across its course: several things that stand, of which scans see now these and now those."""
 ASKED_PLACES = 8
 """So many segments at either end of a track tell whether it was free while the object was elsewhere."""
 SIZE_RATIO, SIZE_MARGIN_M, FREE_SHARE = 1.5, 0.5, 0.2
@@ -243,7 +245,7 @@ def _motion_of_track(
         least = max(free.of_displaced * share, free.of_standing)
         displaced = _free_elsewhere(members, segments, hits, misses, moved.shift_m, least)
         displaced &= not bool(is_occupied(hit, missed))
-        if not displaced and counted_in is not None:
+        if not displaced and counted_in is not None and moved.width_m <= WIDEST_M:
             displaced = _free_without(members, segments, moved.shift_m, share, counted_in)
     reason = f"seen through {missed:,.0f} times, hit {hit:,.0f} times"
     if moved and displaced:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from factor_graphs.sessions import components
+from gnss_sem_map.dynamics.clusters import LONGEST_M
 from gnss_sem_map.dynamics.constant_acceleration import SmoothedTrack, smooth
 from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
 from gnss_sem_map.dynamics.object_track import CAR_M, LORRY_M, SMALL_M, ObjectTrack, courses
@@ -44,7 +45,7 @@ VEHICLE, UNKNOWN = "vehicle", "unknown"
 SHAPES = (
     ("person", 0.0, 1.2, 1.2, 0.8, 2.3),
     ("cyclist", 1.2, 2.3, 1.2, 0.8, 2.3),
-    (VEHICLE, 2.3, 14.0, 3.2, 0.6, 4.5),
+    (VEHICLE, 2.3, LONGEST_M, 3.2, 0.6, 4.5),
 )
 """Classes by shape: least and greatest length, greatest width, least and greatest height, m."""
 FASTEST_WALK_MPS, WIDEST_RIDER_M = 2.5, 1.2

@@ -46,6 +46,8 @@ class OwnMotion:
     """It went on in one direction, and not at one jump."""
     length_m: float
     """The greatest extent of the object along its course."""
+    width_m: float = 0.0
+    """What it usually shows across its course."""
 
     @property
     def is_moving(self) -> bool:
@@ -58,11 +60,12 @@ def own_motion(
     high: NDArray[np.float64],
     lidar: NDArray[np.float64],
     ranges: NDArray[np.float64],
+    width_m: float = 0.0,
 ) -> OwnMotion | None:
     """Motion of a track along its course; None for one of few scans.
 
     `low`, `high` and `lidar` (k,) m are the ends of what was seen of the object, and the LiDAR, along the course;
-    `ranges` (k,) m the distance between them.
+    `ranges` (k,) m the distance between them; `width_m` is what it usually shows across.
     """
     if len(low) < LEAST_SCANS:
         return None
@@ -85,7 +88,7 @@ def own_motion(
     way, largest = abs(steps).sum(), abs(steps).max(initial=0.0)
     largest = max(largest, _growth(centre[start : end + 1], (high - low)[placed][start : end + 1]))
     is_steady = bool(abs(shift) > STEADY_SHARE * way and largest < LARGEST_STEP_SHARE * abs(shift))
-    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady, length)
+    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady, length, width_m)
 
 
 def _growth(centre: NDArray[np.float64], extent: NDArray[np.float64]) -> float:
@@ -116,7 +119,10 @@ def motion_of(segments: Sequence[Segment]) -> OwnMotion | None:
     along = way[np.linalg.norm(way, axis=1).argmax()]
     length = float(np.linalg.norm(along))
     along = -along / length if length else np.array([1.0, 0.0])
-    ends = np.array([(values.min(), values.max()) for one in whole for values in [one.outline() @ along]])
+    across = np.array([-along[1], along[0]])
+    outlines = [one.outline() for one in whole]
+    ends = np.array([(values.min(), values.max()) for seen in outlines for values in [seen @ along]])
+    width = float(np.median([np.ptp(seen @ across) for seen in outlines]))
     lidar = np.array([one.seen_from @ along for one in whole])
     ranges = np.array([np.linalg.norm(one.centroid - one.seen_from) for one in whole])
-    return own_motion(ends[:, 0], ends[:, 1], lidar, ranges)
+    return own_motion(ends[:, 0], ends[:, 1], lidar, ranges, width)

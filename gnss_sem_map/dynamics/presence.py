@@ -74,8 +74,16 @@ def unusually_large(objects: Sequence[TrackedObject], listed: Sequence[Segment])
     for one in objects:
         if one.motion in GONE and len(one.segments) >= LEAST_SCANS:
             size = np.array([np.linalg.norm(np.ptp(listed[n].outline(), axis=0)) for n in one.segments])
-            is_large[list(one.segments)] = size > SIZE_RATIO * np.median(size) + SIZE_MARGIN_M
+            points = np.array([listed[n].points for n in one.segments])
+            is_large[list(one.segments)] = size > SIZE_RATIO * _median(size, points) + SIZE_MARGIN_M
     return is_large
+
+
+def _median(values: Array, weights: NDArray[np.int64]) -> float:
+    """The weighted median: from afar a long vehicle shows a part of itself, with few points, in many scans."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) / weights.sum()
+    return float(values[order[np.searchsorted(share, 0.5)]])
 
 
 def near_movers(

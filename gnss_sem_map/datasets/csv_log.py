@@ -47,9 +47,9 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuSamples, WheelSpeeds, clean_imu, clean_wheels
 from factor_graphs.receiver_rows import MORE_COLUMNS
 from factor_graphs.surveyed_points import SurveyedPoints
-from factor_graphs.tables import layout_of
+from factor_graphs.tables import Column, layout_of
 from gnss_sem_map.datasets import frames
-from gnss_sem_map.datasets.gnss_files import read_gnss_file
+from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
 from gnss_sem_map.datasets.receiver import Receiver, measured
@@ -63,6 +63,8 @@ from gnss_sem_map.sensor_log.conventions import SensorConventions
 Array = NDArray[np.float64]
 MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
+SIDES = ("N", "S", "E", "W")
+"""Letters of the hemispheres, behind a latitude or longitude or in a column of their own."""
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
 STAMPS = "stamps.csv"
@@ -144,26 +146,43 @@ def _missing(path: Path, columns: tuple[str, ...]) -> Skip:
 
 def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Array, list[Skip]]:
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
-    path, skips = drive / "gnss.csv", []
-    if about.gnss_file is None:
-        try:
-            given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
-        except DataError as error:
-            other = f"a table without deviations, or above a geoid: `gnss_file: {{path: {path.name}}}` in log.yaml"
-            raise DataError(f"{error}; {other}") from None
-    elif is_file(path) and about.gnss_file.path != path.name:
+    path, skips, file = drive / "gnss.csv", list[Skip](), about.gnss_file
+    if file is not None and is_file(path) and file.path != path.name:
         raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
+    if file is None and not _is_of_our_columns(path):
+        file = GnssFile(path=path.name)
+    if file is None:
+        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
     else:
-        path = drive / about.gnss_file.path
+        path = drive / file.path
         span_ns = None
         if imu_stamps is not None:
             first, last = about.epoch_ns + np.round(imu_stamps[[0, -1]] * 1e9).astype(np.int64)
             span_ns = int(first), int(last)
-        found = read_gnss_file(about.gnss_file, drive, about.epoch_ns, span_ns)
+        try:
+            found = read_gnss_file(file, drive, about.epoch_ns, span_ns)
+        except DataError as error:
+            if about.gnss_file is not None:
+                raise
+            raise DataError(f"{error}; such keys are of `gnss_file: {{path: {path.name}}}` in log.yaml") from None
         given, skips = found.rows, found.skips
     with _as_data_error():
         rows, invalid = fix_rows(given, shown(path))
     return rows, skips + [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
+
+
+def _is_of_our_columns(path: Path) -> bool:
+    """Whether a table has all columns of gnss.csv, as numbers; another is read as other programs write positions."""
+    try:
+        layout = layout_of(_content(path, GNSS_COLUMNS), GNSS_COLUMNS, MORE_COLUMNS)
+        found = [layout.column(name) for name in GNSS_COLUMNS]
+    except (DataError, MeasurementError):
+        return True  # told by the usual reader
+    cells = [layout.first[one.at] for one in found if one is not None and one.at < len(layout.first)]
+    beside = ["".join(layout.first[one.at + 1 :][:1]) for one in found[1:3] if one is not None]
+    if not layout.first or all(one is None for one in found):
+        return True
+    return None not in found and not any(cell[-1:].upper() in SIDES for cell in [*cells[1:3], *beside])
 
 
 def _wheels(path: Path, about: LogFile) -> tuple[WheelSpeeds | None, list[Skip]]:
@@ -190,12 +209,19 @@ def _numbers(
     with _as_data_error():
         content = _content(path, columns)
         for name, key in UNIT_KEYS.items():
-            column = layout_of(content, columns).column(name) if name in columns else None
+            column = _column(content, columns, name, shown(path)) if name in columns else None
             if column is not None and column.scale != 1.0 and getattr(about, key) is not None:
                 raise DataError(
                     f"{shown(path)}: the unit of {name} is in its header, and {key} in log.yaml; remove {key}"
                 )
         return parse_numbers(content, columns, shown(path), longest_step_s, more, about.epoch_ns)
+
+
+def _column(content: bytes, columns: tuple[str, ...], name: str, where: str) -> Column | None:
+    try:
+        return layout_of(content, columns).column(name)
+    except MeasurementError as error:
+        raise DataError(f"{where}: {error}") from None
 
 
 def _content(path: Path, columns: tuple[str, ...]) -> bytes:

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
-from factor_graphs.table_dates import DATE, seconds_of_dates, unix_scale
-from factor_graphs.tables import Column, Layout, layout_of
+from factor_graphs.table_dates import are_dates, days_of, seconds_of_dates, unix_scale
+from factor_graphs.tables import NAMES, Column, Layout, layout_of
 from gnss_sem_map.datasets.gnss_files.positions import Positions, geodetic_of_ecef, thinned
 from gnss_sem_map.datasets.gnss_files.sbet import over_weeks
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, GPS_EPOCH_NS, WEEK_NS, nearest
-from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR
+from gnss_sem_map.datasets.stamps import LAST_YEAR
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import MOST_LINES, MOST_TEXT_BYTES, read_bytes, shown
 from gnss_sem_map.sensor_log import Skip
@@ -43,8 +43,8 @@ EXPECTED = (
 DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
 LARGEST, LATEST_S = 1e19, (LAST_YEAR - 1970) * 366 * DAY_S
 """No number of a table is larger, and no time of a drive is later."""
-MONTHS_FIRST = (2, 0, 1)
-"""Month, day, year, as Inertial Explorer has a date that does not begin with the year."""
+SIDES = {"lat_deg": "NS", "lon_deg": "EW"}
+"""Letters of the hemispheres above and below zero, which may have a column of their own behind an angle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +72,18 @@ class _Table:
 
     def numbers(self, name: str) -> Array:
         """Numbers of a column in our units; NaN for what is none."""
-        return np.array([_number(text) for text in self.texts(name)]) * self.columns[name].scale
+        return self.columns[name].in_our_units(np.array([_number(text) for text in self.texts(name)]))
+
+    def beside(self, name: str) -> list[str]:
+        """The cells behind a column."""
+        at = self.columns[name].at + 1
+        rows = (line.split(self.layout.separator) for line in self.lines)
+        return ["".join(row[at : at + 1]).strip().strip('"').upper() for row in rows]
 
 
-def read(path: Path, near_ns: int | None, has_stddevs: bool) -> Positions:
+def read(path: Path, content: bytes, near_ns: int | None, has_stddevs: bool) -> Positions:
     """Positions of a table, at most ten a second; raises DataError where it is none, or tells no accuracy."""
-    table = _opened(path)
+    table = _opened(path, content)
     moments, system = _moments(table, near_ns, path)
     count, usable = len(moments), np.abs(moments) < LATEST_S
     rows = np.flatnonzero(usable)
@@ -108,8 +114,7 @@ def read(path: Path, near_ns: int | None, has_stddevs: bool) -> Positions:
     )
 
 
-def _opened(path: Path) -> _Table:
-    content = read_bytes(path, MOST_TEXT_BYTES)
+def _opened(path: Path, content: bytes) -> _Table:
     try:
         layout = layout_of(content, NAMED)
         found = {name: layout.column(name) for name in NAMED}
@@ -121,7 +126,10 @@ def _opened(path: Path) -> _Table:
         raise DataError(f"{shown(path)}: found {len(lines)} lines, expected at most {MOST_LINES}")
     columns = {name: column for name, column in found.items() if column is not None}
     if not lines or not ({"lat_deg", "lat_d", "x_m"} & columns.keys()):
-        raise DataError(f"{shown(path)}: found {layout.shown or 'nothing'}; {EXPECTED}")
+        projected = {"easting_m", "northing_m"} & {name for name in NAMES if layout.column(name) is not None}
+        why = "eastings and northings; write latitude and longitude (cs2cs EPSG:... EPSG:4979)" if projected else ""
+        why = why or layout.missing("lat_deg", ("time", "latitude", "longitude", "altitude"))
+        raise DataError(f"{shown(path)}: {why if lines else 'empty'}; {EXPECTED}")
     if layout.decimal == ",":
         lines = [line.replace(",", ".") for line in lines]
     cells = len(lines[0].split(layout.separator))
@@ -145,7 +153,12 @@ def _places(table: _Table, path: Path) -> tuple[Array, bool]:
 
 def _angles(table: _Table, name: str) -> Array:
     if table.has(name):
-        return np.array([_degrees(text) for text in table.texts(name)]) * table.columns[name].scale
+        degrees = table.columns[name].in_our_units(np.array([_degrees(text) for text in table.texts(name)]))
+        sides = np.array([] if table.are_angles_split else table.beside(name))
+        above, below = SIDES[name]
+        if len(sides) and np.isin(sides, (above, below)).all():
+            degrees = np.where(sides == below, -np.abs(degrees), degrees)
+        return degrees
     parts = zip(*(table.texts(part) for part in PARTS[name]), strict=True)
     return np.array([_degrees(" ".join(texts)) for texts in parts])
 
@@ -160,11 +173,11 @@ def _moments(table: _Table, near_ns: int | None, path: Path) -> tuple[Array, Sys
     texts = table.texts(name)
     label = table.layout.header[table.columns[name].at].lower()
     is_gps = name == "sow" or label.startswith(("gps", "hr"))  # CSRS-PPP has GPS time
-    if any(map(DATE.fullmatch, texts[:100])):
-        return seconds_of_dates(texts, 0), "gps" if is_gps else "utc"
     clock = np.array([_clock(text) for text in texts])
+    if are_dates(texts) and np.isnan(clock).all():  # with the day
+        return seconds_of_dates(texts, 0), "gps" if is_gps else "utc"
     if table.has("date"):
-        days = _days(table.texts("date"))
+        days = days_of(table.texts("date"))
         sundays = days - (days / DAY_S + 4) % 7 * DAY_S
         return np.where(clock >= DAY_S, sundays, days) + clock, "gps" if is_gps else "utc"
     column = table.columns[name]
@@ -195,24 +208,6 @@ def _nearest(
     moments = np.full(len(clock), np.nan)
     moments[known] = nearest(start + np.round(times * 1e9).astype(np.int64), period, near_ns) * 1e-9
     return moments, "utc" if is_of_day else "gps"
-
-
-def _days(texts: list[str]) -> Array:
-    """Dates (n,) as s since 1970; one that does not begin with its year begins with the month, unless none does."""
-    parts = [[int(word) for word in re.findall(r"\d{1,4}", text)][:3] for text in texts]
-    first = max((part[0] for part in parts if len(part) == 3), default=0)
-    order = (0, 1, 2) if first > 31 else MONTHS_FIRST if first <= 12 else (2, 1, 0)
-    return np.array([_day(part, order) for part in parts])
-
-
-def _day(part: list[int], order: tuple[int, int, int]) -> float:
-    if len(part) < 3 or not FIRST_YEAR <= part[order[0]] <= LAST_YEAR:
-        return float("nan")
-    year, month, day = (part[k] for k in order)
-    try:
-        return float(np.datetime64(f"{year:04d}-{month:02d}-{day:02d}", "s").astype(np.int64))
-    except ValueError:
-        return float("nan")
 
 
 def _clock(text: str) -> float:

@@ -8,6 +8,7 @@ the IMU can be read without a receiver, `read_imu(path)` does.
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -18,7 +19,7 @@ from factor_graphs.measurements import ImuSamples
 from gnss_sem_map.datasets.given_trajectory import along
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar")
@@ -95,6 +96,9 @@ def open_drive(
     `trajectory`: a file of poses in place of the drive's own, see `given_trajectory`.
     """
     log: SensorLog = _reader(Path(drive), drive_format).read(Path(drive), with_imu)
+    if not log.scans and Path(drive).is_dir() and (packed := archives_in(Path(drive))):
+        lost = Skip("scan", shown(drive), f"no scans, but archives: unpack {', '.join(packed)}", len(packed))
+        log = replace(log, skips=(*log.skips, lost))
     if trajectory is not None:
         return along(log, Path(trajectory), with_imu)
     log.check_located()

@@ -68,6 +68,10 @@ SIDES = ("N", "S", "E", "W")
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
 STAMPS = "stamps.csv"
+HOW_TO_WRITE = {
+    "scan": "; numpy.column_stack([x, y, z, intensity, time]).astype('<f4').tofile(NAME) writes one",
+    "image": "",
+}
 UNIT_KEYS = {"ax": "force_unit", "wx": "rate_unit", "speed_mps": "speed_unit"}
 FORMAT, SIGNS = "table", "imu.csv and gnss.csv, or lidar/stamps.csv (CSV log)"
 
@@ -278,8 +282,9 @@ def _stamped(
     """Number, stamp and file of every frame that has a stamp and a file; and the skipped frames."""
     found = frames.numbered(what, folder, *suffixes)
     if not found.files and is_folder(folder) and (n := sum(path.name != STAMPS for path in inside(folder))):
+        endings = ", ".join(sorted({path.suffix for path in inside(folder) if path.name != STAMPS})[:5])
         name = f"{what}s are named by their numbers, such as 0000000007{suffixes[0]}"
-        found.skips.append(Skip(what, shown(folder), f"found {n} others; {name}", n))
+        found.skips.append(Skip(what, shown(folder), f"found {n} others ({endings}); {name}{HOW_TO_WRITE[what]}", n))
     if not found.files and not is_file(folder / STAMPS):
         return [], found.skips
     stamps, skips = _stamps(folder / STAMPS, what, epoch_ns)

@@ -230,6 +230,8 @@ def parse_columns(
     try:
         layout = layout_of(content, types, more)
         found = {name: layout.column(name) for name in (*types, *more, *also)}
+        if also and found[STAMP] is None:
+            found[STAMP] = found["date"]
     except MeasurementError as error:
         raise MeasurementError(f"{where}: {error}; {expected}") from None
     if layout.header in ([], [""]):

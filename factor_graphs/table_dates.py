@@ -16,11 +16,12 @@ DATE = re.compile(
     re.IGNORECASE,
 )
 """ISO 8601 and its neighbours, or a time of day alone; without a zone it is UTC."""
-MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
+MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 FIRST_YEAR, LAST_YEAR = 1900, 2199
 """Of nanoseconds in 64 bits."""
 UNIX_FROM = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Larger numbers are no seconds of any year, but Unix time in ns, us, ms."""
+DAY_S = 86_400.0
 YEAR_FIRST, MONTH_FIRST, DAY_FIRST = (0, 1, 2), (2, 0, 1), (2, 1, 0)
 """Places of year, month and day."""
 
@@ -32,13 +33,22 @@ def are_dates(texts: Sequence[str]) -> bool:
 
 
 def seconds_of_dates(texts: Iterable[str | None], epoch_ns: int) -> Array:
-    """Dates as seconds (n,) since an epoch, Unix ns; times alone as seconds of their day. NaN for what is none."""
+    """Dates as seconds (n,) since an epoch, Unix ns; NaN for what is none.
+
+    Times alone are seconds of the first day.
+    """
     found = [DATE.fullmatch(text or "") for text in texts]
     names = [one[1] for one in found if one is not None and one[1] is not None]
     days = dict(zip(names, days_of(names).tolist(), strict=True))
-    return np.array([
+    seconds = np.array([
         np.nan if one is None else _seconds(one, days.get(one[1]), epoch_ns) for one in found
     ])  # fmt: skip
+    if names:
+        return seconds
+    known = np.isfinite(seconds)
+    of_day = seconds[known]
+    seconds[known] += DAY_S * np.cumsum(np.diff(of_day, prepend=of_day[:1]) < -DAY_S / 2)
+    return seconds
 
 
 def _seconds(found: re.Match[str], day_s: float | None, epoch_ns: int) -> float:

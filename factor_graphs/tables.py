@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 
-HEADER_BYTES, HEADER_LINES = 100_000, 100
+HEADER_BYTES, HEADER_LINES, MAGIC_BYTES = 100_000, 100, 64
 MOST_COLUMNS, LONGEST_NAME = 1000, 200
 SEPARATORS = ";\t|,"
 COMMENT = re.compile(r"^\s*(?:#|%|//)+\s*")
@@ -49,19 +49,19 @@ UNITS = {
 """By kind: unit -> what a number of it is multiplied by."""
 _FORCE = "a acc accel accelerometer acceleration linearacceleration linearacc linacc specificforce force arss"
 _RATE = "w g gyr gyro gyroscope omega angularvelocity angularvel angvel angularrate rotationrate rate wrss"
-_ACROSS = "hacc horizontalaccuracy haccuracy accuracy"
+ACROSS = "hacc horizontalaccuracy haccuracy accuracy"
 _NAMES: dict[str, dict[str, str]] = {
     "time": {
-        "stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc gpst sec secs seconds"
-        " secondselapsed gpstime sow tow gpstow date",
+        "stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc gpst sec secs"
+        " seconds secondselapsed gpstime sow tow gpstow",
     },
     "angle": {"lat_deg": "lat latitude", "lon_deg": "lon lng long longitude"},
     "length": {
         "alt_m": "alt hell althae ellipsoidheight ellipsoidalheight heightellipsoid altitude height hgt h",
         "msl_m": "msl hmsl altmsl altitudemsl heightmsl orthometricheight elevation ele",
         "separation_m": "separation geoidseparation geoidsep geoidheight undulation",
-        "std_e_m": f"stde sde sdeast eastsd stdeast sigmae sigmaeast eaststd eaststddev sdlon stdlon {_ACROSS}",
-        "std_n_m": f"stdn sdn sdnorth northsd stdnorth sigman sigmanorth northstd northstddev sdlat stdlat {_ACROSS}",
+        "std_e_m": f"stde sde sdeast eastsd stdeast sigmae sigmaeast eaststd eaststddev sdlon stdlon {ACROSS}",
+        "std_n_m": f"stdn sdn sdnorth northsd stdnorth sigman sigmanorth northstd northstddev sdlat stdlat {ACROSS}",
         "std_u_m": "stdu sdu sdup upsd sdheight heightsd stdup sigmau sigmaup upstd upstddev sdhgt stdalt vacc"
         " verticalaccuracy vaccuracy",
         "x_m": "xecef ecefx", "y_m": "yecef ecefy", "z_m": "zecef ecefz", "easting_m": "easting",
@@ -75,7 +75,8 @@ _NAMES: dict[str, dict[str, str]] = {
     },
     "none": {
         "number": "number frame index frameid framenumber seq no id", "name": "name point pointname pointid id",
-        "stamp_ns": "headerstampnanosec headerstampnsec headerstampnsecs stampnanosec stampnsec stampnsecs nanosec nsec nsecs",
+        "stamp_ns": "headerstampnanosec headerstampnsec headerstampnsecs stampnanosec stampnsec stampnsecs nanosec nsec"
+        " nsecs",
         "type": "type", "epsg": "epsg", "heading_deg": "headingdeg", "std_heading_deg": "stdheadingdeg",
         "corr_en": "corren", "corr_eu": "correu", "corr_nu": "corrnu",
         "week": "week gpsweek weekno", "sow": "gpstime corrtime sow tow gpstow gpssow",
@@ -198,8 +199,8 @@ class Layout:
 
 def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = ()) -> Layout:
     """How a table is written that has `wanted` columns, and perhaps some of `most`; of another, by its first line."""
-    content = _utf8(content)
-    if b"\0" in content[:HEADER_BYTES]:
+    content = as_utf8(content)
+    if b"\0" in content[:MAGIC_BYTES]:
         raise MeasurementError(
             "is no text (a spreadsheet, an archive, or another binary file); save it as CSV in UTF-8"
         )
@@ -222,7 +223,7 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
     return Layout([*header, ""] if is_ended else header, rows, separator, decimal)
 
 
-def _utf8(content: bytes) -> bytes:
+def as_utf8(content: bytes) -> bytes:
     """UTF-16, which other programs write, as UTF-8; lines of old ones end in line feeds."""
     high, low = (2 * content[k:200:2].count(0) >= len(content[k:200:2]) > 0 for k in (0, 1))
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):

@@ -61,7 +61,9 @@ def detect_format(drive: Path) -> str:
     found = [shown(path.name) for path in inside(drive)][:8]
     signs = ", or ".join(f"{reader.SIGNS}" for reader in readers().values())
     packed = archives_in(drive)
-    way = f"; unpack {', '.join(packed)}" if packed else "; other data: write a CSV log (docs/your_own_log.md)"
+    way = (
+        f"; unpack {', '.join(packed)}" if packed else "; other data: write a CSV log (docs/your_own_log.md)"
+    )
     raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}{way}")
 
 

@@ -168,7 +168,9 @@ def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Ar
         except DataError as error:
             if about.gnss_file is not None:
                 raise
-            raise DataError(f"{error}; such keys are of `gnss_file: {{path: {path.name}}}` in log.yaml") from None
+            raise DataError(
+                f"{error}; such keys are of `gnss_file: {{path: {path.name}}}` in log.yaml"
+            ) from None
         given, skips = found.rows, found.skips
     with _as_data_error():
         rows, invalid = fix_rows(given, shown(path))
@@ -284,7 +286,9 @@ def _stamped(
     if not found.files and is_folder(folder) and (n := sum(path.name != STAMPS for path in inside(folder))):
         endings = ", ".join(sorted({path.suffix for path in inside(folder) if path.name != STAMPS})[:5])
         name = f"{what}s are named by their numbers, such as 0000000007{suffixes[0]}"
-        found.skips.append(Skip(what, shown(folder), f"found {n} others ({endings}); {name}{HOW_TO_WRITE[what]}", n))
+        found.skips.append(
+            Skip(what, shown(folder), f"found {n} others ({endings}); {name}{HOW_TO_WRITE[what]}", n)
+        )
     if not found.files and not is_file(folder / STAMPS):
         return [], found.skips
     stamps, skips = _stamps(folder / STAMPS, what, epoch_ns)

@@ -175,7 +175,11 @@ def read_table(path: Path, columns: int) -> Array:
     if not is_file(path):
         raise DataError(
             f"{shown(path)}: missing; expected one line of {columns} numbers per frame"
-            + ("; it comes with the calibration of the data set (data_odometry_calib.zip)" if columns == 1 else "")
+            + (
+                "; it comes with the calibration of the data set (data_odometry_calib.zip)"
+                if columns == 1
+                else ""
+            )
         )
     rows = []
     for number, line in enumerate(read_lines(path), 1):

@@ -108,8 +108,8 @@ def meaning_of(
         chosen = readings[-means[0][1]]
         if name is None and kind is None and (why := _odd_road(chosen, pictures, label_set)):
             raise ConfigError(
-                f"{found} {chosen.kind} of {chosen.source.name}, but then {why}; are they of another data set? say it"
-                f" with ?taxonomy=camvid, mapillary, ade20k or a YAML file, or with ?ids={chosen.kind} if they are these"
+                f"{found} {chosen.kind} of {chosen.source.name}, but then {why}; are they of another data set? say so"
+                f" by ?taxonomy=camvid, mapillary, ade20k or a YAML file, or ?ids={chosen.kind} if they are these"
             )
         return chosen
     kinds = [readings[i].kind for i in best]

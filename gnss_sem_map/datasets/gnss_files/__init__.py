@@ -102,7 +102,7 @@ def _read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: b
     lines = read_lines(path)
     if rtklib.is_solution(lines):
         return rtklib.read(path, lines)
-    if nmea.is_nmea(lines):
+    if nmea.is_nmea(lines) or (ending in OF_NMEA and content.startswith(b"$")):
         return nmea.read(path, lines, near_ns)
     if why := other_formats.no_positions(content):
         raise DataError(f"{shown(path)}: {why}")

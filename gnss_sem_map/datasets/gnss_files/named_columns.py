@@ -18,12 +18,18 @@ from numpy.typing import NDArray
 from factor_graphs.errors import MeasurementError
 from factor_graphs.table_dates import are_dates, days_of, seconds_of_dates, unix_scale
 from factor_graphs.tables import NAMES, Column, Layout, layout_of
-from gnss_sem_map.datasets.gnss_files.positions import Positions, geodetic_of_ecef, thinned
+from gnss_sem_map.datasets.gnss_files.positions import (
+    FLAT_STDDEV_M,
+    Positions,
+    geodetic_of_ecef,
+    thinned,
+    without_heights,
+)
 from gnss_sem_map.datasets.gnss_files.sbet import over_weeks
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, GPS_EPOCH_NS, WEEK_NS, nearest
 from gnss_sem_map.datasets.stamps import LAST_YEAR
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import MOST_LINES, MOST_TEXT_BYTES, read_bytes, shown
+from gnss_sem_map.files.untrusted import MOST_LINES, shown
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -93,14 +99,18 @@ def read(path: Path, content: bytes, near_ns: int | None, has_stddevs: bool) -> 
     table = _Table(
         table.layout, table.columns, [table.lines[k] for k in rows.tolist()], table.are_angles_split
     )
-    if not table.has(*STDDEVS) and not has_stddevs:
+    is_flat = not ({"alt_m", "msl_m", "x_m"} & table.columns.keys())
+    told = STDDEVS[:2] if is_flat else STDDEVS
+    if not table.has(*told) and not has_stddevs:
         raise DataError(
             f"{shown(path)}: {table.layout.shown} does not tell its accuracy; set `stddevs_m: [east, north, up]`"
         )
     places, above_geoid = _places(table, path)
     stddevs = np.column_stack(
-        [table.numbers(name) if table.has(*STDDEVS) else np.ones(len(rows)) for name in STDDEVS]
+        [table.numbers(name) if table.has(*told, name) else np.ones(len(rows)) for name in STDDEVS]
     )
+    if is_flat:
+        stddevs[:, 2] = FLAT_STDDEV_M
     known = np.isfinite(places).all(axis=1) & np.isfinite(stddevs).all(axis=1)
     if not known.any():
         raise DataError(
@@ -108,6 +118,7 @@ def read(path: Path, content: bytes, near_ns: int | None, has_stddevs: bool) -> 
         )
     lost += int((~known).sum())
     skips = [Skip("fix", shown(path), f"{lost} rows without a time or a place", lost)] if lost else []
+    skips += [without_heights(shown(path), int(known.sum()))] if is_flat else []
     stamps = np.round(moments[known] * 1e9).astype(np.int64)
     return Positions(
         stamps, places[known], stddevs[known], system, skips, above_geoid=np.full(len(stamps), above_geoid)
@@ -127,7 +138,11 @@ def _opened(path: Path, content: bytes) -> _Table:
     columns = {name: column for name, column in found.items() if column is not None}
     if not lines or not ({"lat_deg", "lat_d", "x_m"} & columns.keys()):
         projected = {"easting_m", "northing_m"} & {name for name in NAMES if layout.column(name) is not None}
-        why = "eastings and northings; write latitude and longitude (cs2cs EPSG:... EPSG:4979)" if projected else ""
+        why = (
+            "eastings and northings; write latitude and longitude (cs2cs EPSG:... EPSG:4979)"
+            if projected
+            else ""
+        )
         why = why or layout.missing("lat_deg", ("time", "latitude", "longitude", "altitude"))
         raise DataError(f"{shown(path)}: {why if lines else 'empty'}; {EXPECTED}")
     if layout.decimal == ",":
@@ -141,8 +156,10 @@ def _places(table: _Table, path: Path) -> tuple[Array, bool]:
     if table.has(*GEOCENTRIC) and not table.has("lat_deg"):
         return geodetic_of_ecef(np.column_stack([table.numbers(name) for name in GEOCENTRIC])), False
     angles = [_angles(table, name) for name in ANGLES if table.has(name) or table.has(*PARTS[name])]
-    if len(angles) < len(ANGLES) or not ({"alt_m", "msl_m"} & table.columns.keys()):
+    if len(angles) < len(ANGLES):
         raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
+    if not ({"alt_m", "msl_m"} & table.columns.keys()):
+        return np.column_stack([*angles, np.zeros(len(table.lines))]), False
     if table.has("alt_m"):
         return np.column_stack([*angles, table.numbers("alt_m")]), False
     height = table.numbers("msl_m")
@@ -167,7 +184,7 @@ def _moments(table: _Table, near_ns: int | None, path: Path) -> tuple[Array, Sys
     """Times (n,), s since 1970 on their clock, NaN for what is none; and which clock it is."""
     if table.has("week", "sow"):
         return GPS_EPOCH_NS * 1e-9 + table.numbers("week") * WEEK_S + table.numbers("sow"), "gps"
-    name = next((name for name in ("sow", "clock", "stamp_s") if table.has(name)), None)
+    name = next((name for name in ("sow", "clock", "stamp_s", "date") if table.has(name)), None)
     if name is None:
         raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
     texts = table.texts(name)

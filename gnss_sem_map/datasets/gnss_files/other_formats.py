@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from factor_graphs.tables import as_utf8
+
 _OF_POSITIONS = "solution type lat lon msl separation datum sd_lat sd_lon sd_hgt"
 LOGS = {
     "BESTPOSA": _OF_POSITIONS,
@@ -13,11 +15,15 @@ LOGS = {
 }
 """Logs of NovAtel in ASCII, the best one first: what stands behind their semicolons (OEM7 Commands and Logs)."""
 BEFORE = "log port sequence idle clock week sow receiver reserved version"
-NO_SOLUTIONS = re.compile(rb"INSUFFICIENT_OBS|NO_CONVERGENCE|COV_TRACE|COLD_START|INS_INACTIVE|INS_ALIGNING|,NONE,")
+NO_SOLUTIONS = re.compile(
+    rb"INSUFFICIENT_OBS|NO_CONVERGENCE|COV_TRACE|COLD_START|INS_INACTIVE|INS_ALIGNING|,NONE,"
+)
 POINT = re.compile(r"<(?:trkpt|wpt|rtept)\b([^>]*)>(.*?)</(?:trkpt|wpt|rtept)>", re.DOTALL)
 HEAD_BYTES = 4096
 
-_OBSERVATIONS = "{} holds observations, not positions; solve them (RTKLIB: convbin, rnx2rtkp) and give the .pos"
+_OBSERVATIONS = (
+    "{} holds observations, not positions; solve them (RTKLIB: convbin, rnx2rtkp) and give the .pos"
+)
 _SENTENCES = "has none of the sentences GGA, GNS and RMC; let the receiver write GGA and RMC"
 OTHERS = tuple(
     (re.compile(sign, re.DOTALL), why)
@@ -45,8 +51,10 @@ def no_positions(content: bytes) -> str:
 
 def as_table(content: bytes) -> bytes:
     """GPX, or a log of NovAtel, as a table with named columns; other content as it is."""
+    content = as_utf8(content)
     if b"<gpx" in content[:HEAD_BYTES]:
-        return "\n".join(["time,lat,lon,msl", *map(_row_of_point, POINT.finditer(_text(content)))]).encode()
+        text = content.decode("utf-8", "replace")
+        return "\n".join(["time,lat,lon,msl", *map(_row_of_point, POINT.finditer(text))]).encode()
     for log, names in LOGS.items():
         rows = re.findall(rb"#(%b,[^\r\n*]*)" % log.encode(), content)
         if rows:
@@ -61,7 +69,3 @@ def _row_of_point(found: re.Match[str]) -> str:
     inner = [re.search(rf"<{name}>([^<]*)<", found[2]) for name in ("time", "ele")]
     time, lat, lon, height = ("" if one is None else one[1].strip() for one in (inner[0], *angles, inner[1]))
     return f"{time},{lat},{lon},{height}"
-
-
-def _text(content: bytes) -> str:
-    return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")

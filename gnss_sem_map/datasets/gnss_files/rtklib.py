@@ -101,7 +101,9 @@ def read(path: Path, lines: list[str]) -> Positions:
 def _parts(lines: list[str]) -> tuple[list[str], list[str]]:
     """The header, whose lines begin with a percent sign or name the columns, and the rows."""
     header = [line for line in lines if line.startswith("%") or _is_of_names(line)]
-    return header, [line for line in lines if line.strip() and not (line.startswith("%") or _is_of_names(line))]
+    return header, [
+        line for line in lines if line.strip() and not (line.startswith("%") or _is_of_names(line))
+    ]
 
 
 def _is_of_names(line: str) -> bool:

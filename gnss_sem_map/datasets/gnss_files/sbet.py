@@ -58,7 +58,9 @@ def is_sbet(content: bytes) -> bool:
     rows = np.frombuffer(content, "<f8").reshape(-1, COLUMNS)[:MOST_TESTED]
     with np.errstate(invalid="ignore"):
         is_of_week = (rows[:, 0] > 0).all() and (rows[:, 0] < 2 * WEEK_S).all()
-        return bool(is_of_week and (np.abs(rows[:, 1]) <= np.pi / 2).all() and (np.diff(rows[:, 0]) > 0).all())
+        return bool(
+            is_of_week and (np.abs(rows[:, 1]) <= np.pi / 2).all() and (np.diff(rows[:, 0]) > 0).all()
+        )
 
 
 def read_poses(path: Path, near_ns: int) -> tuple[NDArray[np.int64], Array, Array]:

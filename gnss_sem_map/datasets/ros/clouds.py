@@ -115,7 +115,9 @@ def times_of(
         )
     for one in UNITS if unit is None else (unit,):
         after = told[:, 0] * UNITS[one] * 1e-9 - told[:, 3]
-        is_of_stamps = np.median(np.abs(after)) < LONGEST_SWEEP_S < middle * UNITS[one] * 1e-9 if len(told) else False
+        is_of_stamps = (
+            np.median(np.abs(after)) < LONGEST_SWEEP_S < middle * UNITS[one] * 1e-9 if len(told) else False
+        )
         if is_of_stamps or UNIX_S[0] < middle * UNITS[one] * 1e-9 < UNIX_S[1]:
             return PointTimes(field, one, True), False
     if unit is not None:

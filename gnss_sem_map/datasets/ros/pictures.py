@@ -39,8 +39,8 @@ def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | Non
     message, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
     if why := unread_encoding(message):
         raise DataError(
-            f"{where}: found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; convert the images"
-            " when they are recorded"
+            f"{where}: found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; record them so, or"
+            " convert them once (image_transport republish)"
         )
     if messages.kind == COMPRESSED_IMAGE:
         picture = decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)

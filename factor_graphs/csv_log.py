@@ -240,7 +240,7 @@ def parse_columns(
         raise MeasurementError(f"{where}: {layout.missing(wrong[0], types)}; {expected}")
     columns = {name: column for name, column in found.items() if column is not None}
     kinds = {name: types.get(name, "float64") for name in columns}
-    if also and are_dates(layout.first[columns[STAMP].at : columns[STAMP].at + 1]):
+    if also and are_dates([layout.first(columns[STAMP].at)]):
         kinds[STAMP] = kinds["date"] = "string"
     if kinds.get("date") == "float64" or columns.get("date") == columns.get(STAMP):
         columns.pop("date", None)

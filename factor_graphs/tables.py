@@ -53,7 +53,7 @@ ACROSS = "hacc horizontalaccuracy haccuracy accuracy"
 _NAMES: dict[str, dict[str, str]] = {
     "time": {
         "stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc gpst sec secs"
-        " seconds secondselapsed gpstime sow tow gpstow",
+        " seconds secondselapsed timestartup gpstime sow tow gpstow",
     },
     "angle": {"lat_deg": "lat latitude", "lon_deg": "lon lng long longitude"},
     "length": {
@@ -67,8 +67,8 @@ _NAMES: dict[str, dict[str, str]] = {
         "x_m": "xecef ecefx", "y_m": "yecef ecefy", "z_m": "zecef ecefz", "easting_m": "easting",
         "northing_m": "northing", "height_m": "",
     },
-    "force": {f"a{x}": " ".join(f"{n}{x}" for n in _FORCE.split()) for x in "xyz"},
-    "rate": {f"w{x}": " ".join(f"{n}{x}" for n in _RATE.split()) for x in "xyz"},
+    "force": {f"a{x}": " ".join([*(f"{n}{x}" for n in _FORCE.split()), f"{x}acc", f"{x}accel"]) for x in "xyz"},
+    "rate": {f"w{x}": " ".join([*(f"{n}{x}" for n in _RATE.split()), f"{x}gyr", f"{x}gyro"]) for x in "xyz"},
     "speed": {
         "speed_mps": "speed velocity vel v wheelspeed vehiclespeed", "ve_mps": "ve", "vn_mps": "vn", "vu_mps": "vu",
         "std_ve_mps": "stdve", "std_vn_mps": "stdvn", "std_vu_mps": "stdvu",
@@ -178,11 +178,14 @@ class Layout:
                 yield Column(k, units[at_end], True)
 
     @cached_property
-    def first(self) -> list[str]:
-        """The cells of the first row."""
-        start = bytes(self.rows[:HEADER_BYTES]).decode("utf-8", "replace").split("\n")[1:]
-        row = next((line for line in start if line.strip()), "")
-        return [cell.strip().strip('"') for cell in _cells(row, self.separator)]
+    def _head(self) -> list[list[str]]:
+        start = bytes(self.rows[:HEADER_BYTES]).decode("utf-8", "replace").split("\n")[1 : HEADER_LINES + 1]
+        return [_cells(line, self.separator) for line in start]
+
+    def first(self, at: int) -> str:
+        """The first cell of a column that has something; empty where there is none."""
+        cells = (row[at].strip().strip('"') for row in self._head if at < len(row))
+        return next((cell for cell in cells if cell), "")
 
     def missing(self, name: str, expected: Collection[str]) -> str:
         """Why a column is not there, and what to do."""

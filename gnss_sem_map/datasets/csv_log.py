@@ -63,14 +63,14 @@ from gnss_sem_map.sensor_log.conventions import SensorConventions
 Array = NDArray[np.float64]
 MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
-SIDES = ("N", "S", "E", "W")
+SIDES = tuple("NSEWnsew")
 """Letters of the hemispheres, behind a latitude or longitude or in a column of their own."""
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
 STAMPS = "stamps.csv"
 HOW_TO_WRITE = {
     "scan": "; numpy.column_stack([x, y, z, intensity, time]).astype('<f4').tofile(NAME) writes one",
-    "image": "",
+    "image": ", or .jpg: convert them",
 }
 UNIT_KEYS = {"ax": "force_unit", "wx": "rate_unit", "speed_mps": "speed_unit"}
 FORMAT, SIGNS = "table", "imu.csv and gnss.csv, or lidar/stamps.csv (CSV log)"
@@ -184,11 +184,9 @@ def _is_of_our_columns(path: Path) -> bool:
         found = [layout.column(name) for name in GNSS_COLUMNS]
     except (DataError, MeasurementError):
         return True  # told by the usual reader
-    cells = [layout.first[one.at] for one in found if one is not None and one.at < len(layout.first)]
-    beside = ["".join(layout.first[one.at + 1 :][:1]) for one in found[1:3] if one is not None]
-    if not layout.first or all(one is None for one in found):
-        return True
-    return None not in found and not any(cell[-1:].upper() in SIDES for cell in [*cells[1:3], *beside])
+    angles = [one.at for one in found[1:3] if one is not None]
+    has_sides = any(layout.first(at)[-1:] in SIDES or layout.first(at + 1) in SIDES for at in angles)
+    return not any(found) or (None not in found and not has_sides)
 
 
 def _wheels(path: Path, about: LogFile) -> tuple[WheelSpeeds | None, list[Skip]]:
@@ -284,11 +282,10 @@ def _stamped(
     """Number, stamp and file of every frame that has a stamp and a file; and the skipped frames."""
     found = frames.numbered(what, folder, *suffixes)
     if not found.files and is_folder(folder) and (n := sum(path.name != STAMPS for path in inside(folder))):
-        endings = ", ".join(sorted({path.suffix for path in inside(folder) if path.name != STAMPS})[:5])
+        endings = sorted({path.suffix for path in inside(folder) if path.name != STAMPS} - {*suffixes})[:5]
         name = f"{what}s are named by their numbers, such as 0000000007{suffixes[0]}"
-        found.skips.append(
-            Skip(what, shown(folder), f"found {n} others ({endings}); {name}{HOW_TO_WRITE[what]}", n)
-        )
+        others, way = (f" ({', '.join(endings)})", HOW_TO_WRITE[what]) if endings else ("", "")
+        found.skips.append(Skip(what, shown(folder), f"found {n} others{others}; {name}{way}", n))
     if not found.files and not is_file(folder / STAMPS):
         return [], found.skips
     stamps, skips = _stamps(folder / STAMPS, what, epoch_ns)

@@ -49,7 +49,7 @@ EXPECTED = (
 DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
 LARGEST, LATEST_S = 1e19, (LAST_YEAR - 1970) * 366 * DAY_S
 """No number of a table is larger, and no time of a drive is later."""
-SIDES = {"lat_deg": "NS", "lon_deg": "EW"}
+SIDES = {"lat_deg": ("N", "S"), "lon_deg": ("E", "W")}
 """Letters of the hemispheres above and below zero, which may have a column of their own behind an angle."""
 
 

@@ -89,9 +89,7 @@ def test_a_cloud_is_seen_from_a_pose_in_its_axes(tmp_path: Path) -> None:
 
 def test_what_is_no_base_is_refused_by_name(tmp_path: Path) -> None:
     metres = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    with pytest.raises(
-        DataError, match=r"^\S*local\.laz: has no coordinate system; .* pdal translate .*EPSG"
-    ):
+    with pytest.raises(DataError, match=r"^\S*local\.laz: has no coordinate system; .*pdal translate .*EPSG"):
         read_base(write(tmp_path / "local.laz", around(metres), epsg=None), FRAME)
     with pytest.raises(DataError, match="holds no points"):
         read_base(write(tmp_path / "empty.laz", around(metres[:1]), withheld=1), FRAME)

@@ -287,9 +287,11 @@ def _in_our_units(
 
 
 def _scale_of(stamps: Array, longest_step_s: float) -> float:
-    """What stamps (n,) of an unknown unit are multiplied by to be seconds."""
+    """What stamps (n,) of an unknown unit are multiplied by to be seconds; 1 for numbers of rows."""
     scale = unix_scale(stamps)
-    fitting = unit_of_steps(stamps, longest_step_s) if scale == 1.0 else None
+    if scale != 1.0 or len(stamps) < 2 or np.nanmedian(np.diff(stamps)) == 1.0:
+        return scale
+    fitting = unit_of_steps(stamps, longest_step_s)
     return scale if fitting is None else UNITS[fitting]
 
 

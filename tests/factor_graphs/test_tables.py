@@ -210,6 +210,10 @@ def test_times_of_day_go_on_over_midnight() -> None:
     [
         (b"0.00,0.1,0,9.8,0,0,0\n0.01,0.1,0,9.8,0,0,0\n", "no line of names; write one"),
         (b"PK\3\4\x14\0\6\0" + bytes(300), "is no text .*save it as CSV"),
+        (
+            joined(["time", *IMU_COLUMNS[1:]], [[str(k), *"123456"] for k in range(9)]).encode(),
+            "are these milli",
+        ),
         (b"Zeit,ax,ay,az,wx,wy,wz\n0,0,0,0,0,0,0\n", "no column stamp_s .*name it so .*time"),
     ],
 )

@@ -249,7 +249,13 @@ def _stamps(path: Path, what: str, epoch_ns: int) -> tuple[dict[int, float], lis
     """
     columns = {"number": "string", "stamp_s": "float64"}
     with _as_data_error():
-        table = parse_columns(_content(path, tuple(columns)), columns, shown(path), epoch_ns)
+        table = parse_columns(
+            _content(path, tuple(columns)),
+            columns,
+            shown(path),
+            epoch_ns,
+            longest_step_s=LONGEST_FRAME_STEP_S,
+        )
     texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
     check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
     stamps: dict[int, float] = {}

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.errors import MeasurementError, RepairWarning
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import (
+    UNITS,
     AntennaHeadings,
     GnssFixes,
     GnssVelocities,
@@ -26,11 +27,12 @@ from factor_graphs.measurements import (
     clean_wheels,
     far_off,
     unit_fault,
+    unit_of_steps,
 )
 from factor_graphs.receiver_rows import GNSS_COLUMNS as GNSS_COLUMNS
 from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
 from factor_graphs.surveyed_points import SurveyedPoints, to_points
-from factor_graphs.table_dates import is_date, seconds_of_dates, unix_scale
+from factor_graphs.table_dates import are_dates, seconds_of_dates, unix_scale
 from factor_graphs.tables import Column, Layout, layout_of
 from factor_graphs.valid_fixes import valid_fixes
 
@@ -194,7 +196,8 @@ def parse_numbers(
     A cell without a value is NaN, and so is a column of `more` that is not there. Raises MeasurementError as
     `parse_columns` does, and for stamps in another unit.
     """
-    table = parse_columns(content, dict.fromkeys(columns, "float64"), where, epoch_ns, more)
+    types = dict.fromkeys(columns, "float64")
+    table = parse_columns(content, types, where, epoch_ns, more, longest_step_s)
     rows = np.full((table.num_rows, len(columns) + len(more)), np.nan)
     for k, name in enumerate([*columns, *more]):
         if name in table.column_names:
@@ -207,32 +210,41 @@ def parse_numbers(
 
 
 def parse_columns(
-    content: bytes, types: Mapping[str, str], where: str, epoch_ns: int = 0, more: tuple[str, ...] = ()
+    content: bytes,
+    types: Mapping[str, str],
+    where: str,
+    epoch_ns: int = 0,
+    more: tuple[str, ...] = (),
+    longest_step_s: float = np.inf,
 ) -> Table:
     """The named columns of a CSV file, each with its Arrow type; a damaged row has none of the damaged values.
 
-    Columns of `more` are numbers that may be missing. Stamps that are dates count from `epoch_ns`, Unix ns. How the
-    table may be written: `tables`. Raises MeasurementError for another table, and where most rows are damaged.
+    Columns of `more` are numbers that may be missing. Stamps that are dates count from `epoch_ns`, Unix ns; where no
+    unit is told, it is one in which their usual step is at most `longest_step_s`. How the table may be written:
+    `tables`. Raises MeasurementError for another table, and where most rows are damaged.
     """
     import pyarrow as pa
 
-    expected = f"expected numbers in columns {','.join(types)}; a stamp is a number of seconds"
+    expected = f"expected numbers in columns {','.join(types)}; a stamp is a number of seconds, or a date"
+    also = ("date", "stamp_ns") if types.get(STAMP) == "float64" else ()
     try:
         layout = layout_of(content, types, more)
-        found = {name: layout.column(name) for name in (*types, *more)}
+        found = {name: layout.column(name) for name in (*types, *more, *also)}
+        if also and found[STAMP] is None:
+            found[STAMP] = found["date"]
     except MeasurementError as error:
         raise MeasurementError(f"{where}: {error}; {expected}") from None
     if layout.header in ([], [""]):
         raise MeasurementError(f"{where}: empty; {expected}")
     if wrong := [name for name in types if found[name] is None]:
-        raise MeasurementError(
-            f"{where}: column {wrong[0]} is missing or repeated in {layout.shown}; {expected}"
-        )
+        raise MeasurementError(f"{where}: {layout.missing(wrong[0], types)}; {expected}")
     columns = {name: column for name, column in found.items() if column is not None}
     kinds = {name: types.get(name, "float64") for name in columns}
-    has_dates = kinds.get(STAMP) == "float64" and is_date(layout, columns[STAMP])
-    if has_dates:
-        kinds[STAMP] = "string"
+    if also and are_dates([layout.first(columns[STAMP].at)]):
+        kinds[STAMP] = kinds["date"] = "string"
+    if kinds.get("date") == "float64" or columns.get("date") == columns.get(STAMP):
+        columns.pop("date", None)
+    kinds = {name: kinds[name] for name in columns}
     try:
         table = _read(layout, columns, kinds)
     except (pa.ArrowException, ValueError, KeyError) as error:
@@ -242,28 +254,45 @@ def parse_columns(
         table = repaired
     if table.num_rows == 0:
         raise MeasurementError(f"{where}: no rows; {expected}")
-    return _in_our_units(table, columns, kinds, epoch_ns if has_dates else None)
+    return _in_our_units(table, columns, kinds, epoch_ns, longest_step_s)
 
 
 def _in_our_units(
-    table: Table, columns: Mapping[str, Column], kinds: Mapping[str, str], epoch_ns: int | None
+    table: Table,
+    columns: Mapping[str, Column],
+    kinds: Mapping[str, str],
+    epoch_ns: int,
+    longest_step_s: float,
 ) -> Table:
-    """The same table in SI units and degrees; with an epoch, its stamps are dates."""
+    """The same table in SI units and degrees; stamps of several columns are one."""
     import pyarrow as pa
 
     for name, column in columns.items():
-        if name == STAMP and epoch_ns is not None:
-            values = seconds_of_dates(table[name].to_pylist(), epoch_ns)
-        elif kinds[name] == "string":
+        if name == STAMP and kinds[name] == "string":
+            texts = table[name].to_pylist()
+            if "date" in columns:
+                days = table["date"].to_pylist()
+                texts = [f"{day} {text}" for day, text in zip(days, texts, strict=True)]
+            values = seconds_of_dates(texts, epoch_ns)
+        elif kinds[name] == "string" or (name != STAMP and column == Column(column.at, 1.0, column.unit)):
             continue
         else:
-            values = table[name].to_numpy().astype(np.float64)
-            scale = column.scale if column.unit or name != STAMP else unix_scale(values)
-            if scale == 1.0:
-                continue
-            values = values * scale
+            values = column.in_our_units(table[name].to_numpy().astype(np.float64))
+            if name == STAMP and "stamp_ns" in columns and not (values % 1).any():
+                values = values + table["stamp_ns"].to_numpy().astype(np.float64) * 1e-9
+            elif name == STAMP and not column.unit:
+                values = values * _scale_of(values, longest_step_s)
         table = table.set_column(table.column_names.index(name), name, pa.array(values))
     return table
+
+
+def _scale_of(stamps: Array, longest_step_s: float) -> float:
+    """What stamps (n,) of an unknown unit are multiplied by to be seconds; 1 for numbers of rows."""
+    scale = unix_scale(stamps)
+    if scale != 1.0 or len(stamps) < 2 or np.nanmedian(np.diff(stamps)) == 1.0:
+        return scale
+    fitting = unit_of_steps(stamps, longest_step_s)
+    return scale if fitting is None else UNITS[fitting]
 
 
 def _read(
@@ -278,20 +307,20 @@ def _read(
     from pyarrow import csv
 
     names = [f"column {k}" for k in range(len(layout.header))]
-    for name, column in columns.items():
-        names[column.at] = name
-    return csv.read_csv(
+    table = csv.read_csv(
         pa.BufferReader(pa.py_buffer(layout.rows)),
         # with several threads an error does not tell its row
         read_options=csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False, encoding=encoding),
         parse_options=csv.ParseOptions(delimiter=layout.separator, invalid_row_handler=if_invalid),
         convert_options=csv.ConvertOptions(
-            include_columns=list(types),
-            column_types={name: pa.type_for_alias(kind) for name, kind in types.items()},
+            include_columns=list(dict.fromkeys(names[columns[name].at] for name in types)),
+            column_types={names[columns[name].at]: pa.type_for_alias(kind) for name, kind in types.items()},
             strings_can_be_null=True,
             decimal_point=layout.decimal,
         ),
     )
+    # one column may have two names: the horizontal accuracy
+    return table.select([names[columns[name].at] for name in types]).rename_columns(list(types))
 
 
 def _without_damage(layout: Layout, columns: Mapping[str, Column], types: Mapping[str, str]) -> Table | None:

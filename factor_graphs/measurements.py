@@ -336,15 +336,28 @@ def far_off(stamps: Array) -> NDArray[np.bool_]:
 
 def unit_fault(stamps: Array, longest_step_s: float) -> str | None:
     """Why stamps (n,) are not seconds, by their usual step, and what they probably are; None if they may be."""
-    finite = np.sort(stamps[np.isfinite(stamps)])
-    with np.errstate(over="ignore"):
-        steps = np.diff(finite)
-    steps = steps[steps > 0]
-    if len(steps) < 2 or (step := float(np.median(steps))) <= longest_step_s:
+    step = _usual_step(stamps)
+    if step <= longest_step_s:
         return None
-    fitting = [unit for unit, scale in UNITS.items() if step * scale <= longest_step_s]
+    unit = unit_of_steps(stamps, longest_step_s)
     fault = f"the usual step between stamps is {step:.6g}, expected seconds, at most {longest_step_s:g}"
-    return fault + (f"; are these {fitting[0]}?" if fitting else "")
+    return fault + (f"; are these {unit}?" if unit else "")
+
+
+def unit_of_steps(stamps: Array, longest_step_s: float) -> str | None:
+    """The unit of `UNITS` in which the usual step of stamps (n,) is short enough; None for seconds, or for none."""
+    step = _usual_step(stamps)
+    if step <= longest_step_s:
+        return None
+    return next((unit for unit, scale in UNITS.items() if step * scale <= longest_step_s), None)
+
+
+def _usual_step(stamps: Array) -> float:
+    """The median of the steps above zero; 0 where there are too few to tell."""
+    with np.errstate(over="ignore"):
+        steps = np.diff(np.sort(stamps[np.isfinite(stamps)]))
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) >= 2 else 0.0
 
 
 def gaps(stamps: Array) -> Array:

@@ -1,52 +1,101 @@
-"""Stamps of tables that are dates, or Unix time in another unit than seconds."""
+"""Stamps of tables that are dates or times of a day, or Unix time in another unit than seconds."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.tables import Column, Layout
-
 Array = NDArray[np.float64]
 
 DATE = re.compile(
-    r"\s*((?:19|20|21)[0-9]{2})[-/.]([0-9]{2})[-/.]([0-9]{2})[T ]+([0-9]{2}:[0-9]{2}:[0-9]{2})(?:[.,]([0-9]+))?"
-    r"\s*(?:Z|UTC|GMT|([+-])([0-9]{2}):?([0-9]{2})?)?\s*",
+    r"\s*(?:([0-9]{4}[-/.][0-9]{1,2}[-/.][0-9]{1,2}|[0-9]{1,2}[-/.](?:[0-9]{1,2}|[a-z]{3})[-/.][0-9]{4})[T, ]+)?"
+    r"([0-9]{1,2}):([0-9]{2}):([0-9]{2})(?:[.,]([0-9]+))?\s*(am|pm)?\s*(?:Z|UTC|GMT|([+-])([0-9]{2}):?([0-9]{2})?)?\s*",
     re.IGNORECASE,
 )
-"""ISO 8601 and its neighbours; without a zone it is UTC. Years are those of nanoseconds in 64 bits."""
+"""ISO 8601 and its neighbours, or a time of day alone; without a zone it is UTC."""
+MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
+FIRST_YEAR, LAST_YEAR = 1900, 2199
+"""Of nanoseconds in 64 bits."""
 UNIX_FROM = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Larger numbers are no seconds of any year, but Unix time in ns, us, ms."""
+DAY_S = 86_400.0
+YEAR_FIRST, MONTH_FIRST, DAY_FIRST = (0, 1, 2), (2, 0, 1), (2, 1, 0)
+"""Places of year, month and day."""
 
 
-def is_date(layout: Layout, column: Column) -> bool:
-    """Whether the first cell of a column that has one is a date."""
-    for row in bytes(layout.rows[:10_000]).decode("utf-8", "replace").split("\n")[1:]:
-        cells = row.split(layout.separator)
-        if column.at < len(cells) and cells[column.at].strip():
-            return DATE.fullmatch(cells[column.at].strip().strip('"')) is not None
-    return False
+def are_dates(texts: Sequence[str]) -> bool:
+    """Whether the first cell that has something is a date, or a time of day."""
+    first = next((text for text in texts if text.strip()), "")
+    return DATE.fullmatch(first) is not None
 
 
 def seconds_of_dates(texts: Iterable[str | None], epoch_ns: int) -> Array:
-    """Dates as seconds (n,) since an epoch, Unix ns; NaN for what is none."""
-    return np.array([_seconds(text or "", epoch_ns) for text in texts])
+    """Dates as seconds (n,) since an epoch, Unix ns; NaN for what is none.
+
+    Times alone are seconds of the first day.
+    """
+    found = [DATE.fullmatch(text or "") for text in texts]
+    names = [one[1] for one in found if one is not None and one[1] is not None]
+    days = dict(zip(names, days_of(names).tolist(), strict=True))
+    seconds = np.array([
+        np.nan if one is None else _seconds(one, days.get(one[1]), epoch_ns) for one in found
+    ])  # fmt: skip
+    if names:
+        return seconds
+    known = np.isfinite(seconds)
+    of_day = seconds[known]
+    seconds[known] += DAY_S * np.cumsum(np.diff(of_day, prepend=of_day[:1]) < -DAY_S / 2)
+    return seconds
 
 
-def _seconds(text: str, epoch_ns: int) -> float:
-    found = DATE.fullmatch(text)
-    if found is None:
+def _seconds(found: re.Match[str], day_s: float | None, epoch_ns: int) -> float:
+    _, hours, minutes, seconds, part, half, sign, zone_hours, zone_minutes = found.groups()
+    hour = int(hours) if half is None else int(hours) % 12 + 12 * (half.lower() == "pm")
+    is_none = hour > 23 or int(minutes) > 59 or int(seconds) > 59 or (day_s is not None and np.isnan(day_s))
+    if is_none:
         return float("nan")
-    year, month, day, clock, part, sign, hours, minutes = found.groups()
+    ns = ((hour * 60 + int(minutes)) * 60 + int(seconds)) * 10**9 + int(((part or "") + "0" * 9)[:9])
+    if day_s is None:
+        return ns * 1e-9
+    ahead_s = 0 if sign is None else int(f"{sign}1") * (int(zone_hours) * 3600 + int(zone_minutes or 0) * 60)
+    return (int(day_s) * 10**9 + ns - ahead_s * 10**9 - epoch_ns) * 1e-9
+
+
+def days_of(texts: Iterable[str]) -> Array:
+    """Dates (n,) as s since 1970; NaN for what is none.
+
+    One that does not begin with its year begins with the day where it has dots or the name of the month, else with
+    the month, unless some number there is larger than 12.
+    """
+    texts = list(texts)
+    parts = {text: _parts(text) for text in texts}
+    firsts = [part[0] for part in parts.values() if len(part) == 3]
+    has_dots = any("." in text or re.search("[A-Za-z]", text) for text in parts)
+    order = YEAR_FIRST if max(firsts, default=0) > 31 else MONTH_FIRST
+    if order == MONTH_FIRST and (has_dots or max(firsts, default=0) > 12):
+        order = DAY_FIRST
+    days = {text: _day(part, order) for text, part in parts.items()}
+    return np.array([days[text] for text in texts])
+
+
+def _parts(text: str) -> list[int]:
+    """The numbers of a date; a month may have a name."""
+    words = re.findall(r"[0-9]{1,4}|[a-z]{3,}", text.lower())[:3]
+    known = [MONTHS.index(word[:3]) + 1 if word[:3] in MONTHS else word for word in words]
+    return [int(word) for word in known] if all(str(word).isdecimal() for word in known) else []
+
+
+def _day(part: list[int], order: tuple[int, int, int]) -> float:
+    if len(part) < 3 or not FIRST_YEAR <= part[order[0]] <= LAST_YEAR:
+        return float("nan")
+    year, month, day = (part[k] for k in order)
     try:
-        moment = np.datetime64(f"{year}-{month}-{day}T{clock}.{(part or '0')[:9]}", "ns")
+        return float(np.datetime64(f"{year:04d}-{month:02d}-{day:02d}", "s").astype(np.int64))
     except ValueError:  # a day that no month has
         return float("nan")
-    ahead_s = 0 if sign is None else int(f"{sign}1") * (int(hours) * 3600 + int(minutes or 0) * 60)
-    return (int(moment.astype(np.int64)) - ahead_s * 10**9 - epoch_ns) * 1e-9
 
 
 def unix_scale(stamps: Array) -> float:

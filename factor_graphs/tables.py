@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 
-HEADER_BYTES, HEADER_LINES = 100_000, 100
+HEADER_BYTES, HEADER_LINES, MAGIC_BYTES = 100_000, 100, 64
 MOST_COLUMNS, LONGEST_NAME = 1000, 200
 SEPARATORS = ";\t|,"
 COMMENT = re.compile(r"^\s*(?:#|%|//)+\s*")
@@ -32,13 +33,13 @@ _SCALES: dict[str, dict[float, str]] = {
         1.0: "s sec secs second seconds hms", 1e-3: "ms msec msecs millis milliseconds",
         1e-6: "us usec usecs micros microseconds", 1e-9: "ns nsec nsecs nanos nanoseconds",
     },
-    "angle": {1.0: "deg degs degree degrees dms", 180 / np.pi: "rad radian radians"},
+    "angle": {1.0: "deg degs degree degrees dms", 180 / np.pi: "rad radian radians", 1e-7: "dege7 1e7deg"},
     "length": {
         1.0: "m meter meters metre metres 68%", 1e-3: "mm", 1e-2: "cm", 0.3048: "ft feet", 1200 / 3937: "usft ftus",
         1 / 1.96: "95%",
     },
     "force": {1.0: "ms2 mps2 mss msecsec", 9.80665: "g gs", 9.80665e-3: "mg"},
-    "rate": {1.0: "rads radps radsec", np.pi / 180: "degs dps degps degsec", np.pi / 180e3: "mdps"},
+    "rate": {1.0: "rads radps radsec rads1", np.pi / 180: "degs dps degps degsec", np.pi / 180e3: "mdps"},
     "speed": {1.0: "ms mps msec", 1 / 3.6: "kmh kph kmph", 1609.344 / 3600: "mph", 1852 / 3600: "kn kt kts knots"},
 }  # fmt: skip
 UNITS = {
@@ -46,29 +47,36 @@ UNITS = {
     for kind, scales in _SCALES.items()
 }
 """By kind: unit -> what a number of it is multiplied by."""
-_FORCE = "a acc accel accelerometer acceleration linearacceleration specificforce force"
-_RATE = "w g gyr gyro gyroscope omega angularvelocity angularrate rotationrate rate"
+_FORCE = "a acc accel accelerometer acceleration linearacceleration linearacc linacc specificforce force arss"
+_RATE = "w g gyr gyro gyroscope omega angularvelocity angularvel angvel angularrate rotationrate rate wrss"
+ACROSS = "hacc horizontalaccuracy haccuracy accuracy"
 _NAMES: dict[str, dict[str, str]] = {
-    "time": {"stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc"},
-    "angle": {"lat_deg": "lat latitude gpslat", "lon_deg": "lon lng long longitude gpslon"},
+    "time": {
+        "stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc gpst sec secs"
+        " seconds secondselapsed timestartup gpstime sow tow gpstow",
+    },
+    "angle": {"lat_deg": "lat latitude", "lon_deg": "lon lng long longitude"},
     "length": {
-        "alt_m": "alt hell ellipsoidheight ellipsoidalheight altitude height hgt h",
+        "alt_m": "alt hell althae ellipsoidheight ellipsoidalheight heightellipsoid altitude height hgt h",
         "msl_m": "msl hmsl altmsl altitudemsl heightmsl orthometricheight elevation ele",
         "separation_m": "separation geoidseparation geoidsep geoidheight undulation",
-        "std_e_m": "stde sde sdeast eastsd stdeast sigmae sigmaeast eaststd eaststddev sdlon stdlon",
-        "std_n_m": "stdn sdn sdnorth northsd stdnorth sigman sigmanorth northstd northstddev sdlat stdlat",
-        "std_u_m": "stdu sdu sdup upsd sdheight heightsd stdup sigmau sigmaup upstd upstddev sdhgt stdalt vacc",
+        "std_e_m": f"stde sde sdeast eastsd stdeast sigmae sigmaeast eaststd eaststddev sdlon stdlon {ACROSS}",
+        "std_n_m": f"stdn sdn sdnorth northsd stdnorth sigman sigmanorth northstd northstddev sdlat stdlat {ACROSS}",
+        "std_u_m": "stdu sdu sdup upsd sdheight heightsd stdup sigmau sigmaup upstd upstddev sdhgt stdalt vacc"
+        " verticalaccuracy vaccuracy",
         "x_m": "xecef ecefx", "y_m": "yecef ecefy", "z_m": "zecef ecefz", "easting_m": "easting",
         "northing_m": "northing", "height_m": "",
     },
-    "force": {f"a{x}": " ".join(f"{n}{x}" for n in _FORCE.split()) for x in "xyz"},
-    "rate": {f"w{x}": " ".join(f"{n}{x}" for n in _RATE.split()) for x in "xyz"},
+    "force": {f"a{x}": " ".join([*(f"{n}{x}" for n in _FORCE.split()), f"{x}acc", f"{x}accel"]) for x in "xyz"},
+    "rate": {f"w{x}": " ".join([*(f"{n}{x}" for n in _RATE.split()), f"{x}gyr", f"{x}gyro"]) for x in "xyz"},
     "speed": {
         "speed_mps": "speed velocity vel v wheelspeed vehiclespeed", "ve_mps": "ve", "vn_mps": "vn", "vu_mps": "vu",
         "std_ve_mps": "stdve", "std_vn_mps": "stdvn", "std_vu_mps": "stdvu",
     },
     "none": {
         "number": "number frame index frameid framenumber seq no id", "name": "name point pointname pointid id",
+        "stamp_ns": "headerstampnanosec headerstampnsec headerstampnsecs stampnanosec stampnsec stampnsecs nanosec nsec"
+        " nsecs",
         "type": "type", "epsg": "epsg", "heading_deg": "headingdeg", "std_heading_deg": "stdheadingdeg",
         "corr_en": "corren", "corr_eu": "correu", "corr_nu": "corrnu",
         "week": "week gpsweek weekno", "sow": "gpstime corrtime sow tow gpstow gpssow",
@@ -79,6 +87,15 @@ _NAMES: dict[str, dict[str, str]] = {
 NAMES = {name: words.split() for names in _NAMES.values() for name, words in names.items()}
 """Name of a column -> what others call it; of several that are there, the first of this list is taken."""
 KINDS = {name: kind for kind, names in _NAMES.items() for name in names}
+WORDS = {word for words in NAMES.values() for word in words}
+VARIANCES = {
+    f"std_{axis}_m": [f"positioncovariance{k}", f"var{axis}", f"var{name}"]
+    for axis, name, k in (("e", "east", 0), ("n", "north", 4), ("u", "up", 8))
+}
+"""Columns whose root is a standard deviation: NavSatFix as tables of it have it, and others."""
+PREFIX = re.compile(r"^(?:(?:imu|gnss|gps|ins|fix|field)[0-9]?[ _:]+|[^/.]*[/.]+)", re.IGNORECASE)
+"""What may stand before a name: the sensor, or a path of it, as tables of ROS topics have it."""
+MOST_PARTS = 8
 
 
 @dataclass(frozen=True)
@@ -88,6 +105,13 @@ class Column:
     at: int
     scale: float = 1.0
     unit: bool = False
+    is_variance: bool = False
+
+    def in_our_units(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Numbers (n,) of this column in SI units or degrees; NaN for a variance below zero."""
+        if not self.is_variance:
+            return numbers * self.scale
+        return np.sqrt(np.where(numbers >= 0, numbers, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,39 +124,75 @@ class Layout:
     decimal: str = "."
 
     @cached_property
-    def _plain(self) -> list[tuple[str, str | None]]:
-        """Name and unit of each column, if it tells one."""
-        cells = [BRACKETS.match(text[:LONGEST_NAME]) for text in self.header]
+    def _plain(self) -> list[list[tuple[str, str | None]]]:
+        """Name and unit of each column, if it tells one; first as it is, then without more and more of its path."""
+        rows = [self._named(self.header)]
+        shorter = self.header
+        while len(rows) < MOST_PARTS and (cut := [PREFIX.sub("", text) for text in shorter]) != shorter:
+            rows.append(self._named(cut))
+            shorter = cut
+        return rows
+
+    @staticmethod
+    def _named(header: list[str]) -> list[tuple[str, str | None]]:
+        cells = [BRACKETS.match(text[:LONGEST_NAME]) for text in header]
         return [
             (_letters(text), None) if cell is None else (_letters(cell[1]), _letters(cell[2]))
-            for text, cell in zip(self.header, cells, strict=True)
+            for text, cell in zip(header, cells, strict=True)
         ]
 
     def column(self, name: str) -> Column | None:
         """The column of a name of `NAMES`; raises MeasurementError where there are two, or its unit is unknown."""
         found = [Column(k, unit=True) for k, text in enumerate(self.header) if text == name]
-        for word in NAMES.get(name, []):
-            found = found or list(self._called(word, name))
+        for named in self._plain:
+            for word in NAMES.get(name, []):
+                found = found or list(self._called(word, name, named))
+        if not found and name in VARIANCES:
+            found = [
+                Column(k, is_variance=True)
+                for named in self._plain[:1]
+                for k, (plain, unit) in enumerate(named)
+                if plain + (unit or "") in VARIANCES[name]
+            ]
+        if len(found) > 1 and name == "stamp_s":  # beside seconds, those below
+            found = [one for one in found if one.scale == 1.0] or found
         if len(found) > 1:
             raise MeasurementError(f"column {name} is missing or repeated in {self.shown}")
         return found[0] if found else None
 
-    def _called(self, word: str, name: str) -> Iterator[Column]:
+    def _called(self, word: str, name: str, named: list[tuple[str, str | None]]) -> Iterator[Column]:
         units = UNITS.get(KINDS[name], {})
-        for k, (plain, unit) in enumerate(self._plain):
+        for k, (plain, unit) in enumerate(named):
             is_other = self.header[k] in NAMES
             at_end = plain[len(word) :] if plain.startswith(word) and not is_other else None
-            if at_end == "" and unit in (None, ""):
+            if (at_end == "" and unit in (None, "")) or (unit and plain + unit == word):
                 yield Column(k)
             elif at_end == "" and (unit in units or not units):
                 yield Column(k, units.get(str(unit), 1.0), True)
-            elif at_end == "":
+            elif at_end == "" and plain + str(unit) not in WORDS:
                 raise MeasurementError(
                     f"column {self.header[k][:50]!r} is in a unit that is not known; expected one of"
                     f" {', '.join(units)}; without one, it is in the first"
                 )
             elif at_end in units:
                 yield Column(k, units[at_end], True)
+
+    @cached_property
+    def _head(self) -> list[list[str]]:
+        start = bytes(self.rows[:HEADER_BYTES]).decode("utf-8", "replace").split("\n")[1 : HEADER_LINES + 1]
+        return [_cells(line, self.separator) for line in start]
+
+    def first(self, at: int) -> str:
+        """The first cell of a column that has something; empty where there is none."""
+        cells = (row[at].strip().strip('"') for row in self._head if at < len(row))
+        return next((cell for cell in cells if cell), "")
+
+    def missing(self, name: str, expected: Collection[str]) -> str:
+        """Why a column is not there, and what to do."""
+        if all(NUMBER_CELL.match(cell) for cell in self.header if cell):
+            return f"has no line of names; write one above its rows, such as {','.join(expected)}"
+        names = ", ".join([name, *NAMES.get(name, [])[:5]])
+        return f"found no column {name} in {self.shown}; name it so in its first line (read are {names}, ...)"
 
     @property
     def shown(self) -> str:
@@ -142,7 +202,11 @@ class Layout:
 
 def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = ()) -> Layout:
     """How a table is written that has `wanted` columns, and perhaps some of `most`; of another, by its first line."""
-    content = _utf8(content)
+    content = as_utf8(content)
+    if b"\0" in content[:MAGIC_BYTES]:
+        raise MeasurementError(
+            "is no text (a spreadsheet, an archive, or another binary file); save it as CSV in UTF-8"
+        )
     lines = _decoded(content[:HEADER_BYTES]).split("\n")[:HEADER_LINES]
     at = _header_line(lines, wanted, most)
     header, header_separator = _split(COMMENT.sub("", lines[at]))
@@ -162,12 +226,13 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
     return Layout([*header, ""] if is_ended else header, rows, separator, decimal)
 
 
-def _utf8(content: bytes) -> bytes:
+def as_utf8(content: bytes) -> bytes:
     """UTF-16, which other programs write, as UTF-8; lines of old ones end in line feeds."""
+    high, low = (2 * content[k:200:2].count(0) >= len(content[k:200:2]) > 0 for k in (0, 1))
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         content = content.decode("utf-16", "replace").encode()
-    elif content[1:2] == b"\0" or content[:1] == b"\0":
-        content = content.decode("utf-16-le" if content[1:2] == b"\0" else "utf-16-be", "replace").encode()
+    elif high != low:  # every second byte of Latin letters is zero
+        content = content.decode("utf-16-le" if low else "utf-16-be", "replace").encode()
     return content if b"\n" in content or b"\r" not in content else content.replace(b"\r", b"\n")
 
 

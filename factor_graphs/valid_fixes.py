@@ -33,11 +33,23 @@ def valid_fixes(stamps: Array, geodetic: Array, stddevs: Array) -> tuple[NDArray
     kinds = [
         (is_high, "no height on Earth; is the altitude in mm?"),
         (is_flat, "a place without height: fixes in two dimensions are not used"),
-        (~on_earth, "no place on Earth, or 0, 0"),
+        (~on_earth, f"no place on Earth, or 0, 0{_other_angles(lat[~on_earth], lon[~on_earth])}"),
         (is_place & ~has_accuracy, "a standard deviation that is not above 0, or far too large"),
         (usable & ~near, "too far from the fixes around for any vehicle"),
     ]
     return near, {why: int(rows.sum()) for rows, why in kinds if rows.any()}
+
+
+def _other_angles(lat: Array, lon: Array) -> str:
+    """What latitudes and longitudes probably are that are no degrees; empty where nothing tells."""
+    with np.errstate(all="ignore"):
+        across, along = (np.abs(v[np.isfinite(v)]).max(initial=0.0) for v in (lat, lon))
+    if across <= 90:
+        return ""
+    if across > 1e6:
+        return "; are these degrees times 10^7? name the columns lat_dege7 and lon_dege7"
+    is_nmea = across < 9060 and along < 18060
+    return "; are these degrees and minutes, 4903.5 for 49° 3.5'? write degrees" if is_nmea else ""
 
 
 def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:

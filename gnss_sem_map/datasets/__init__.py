@@ -8,6 +8,7 @@ the IMU can be read without a receiver, `read_imu(path)` does.
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -18,9 +19,10 @@ from factor_graphs.measurements import ImuSamples
 from gnss_sem_map.datasets.given_trajectory import along
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar")
 MOST_SEARCHED, MOST_OFFERED = 300, 8
 """Drives are looked for among so many files and folders of each folder; and so many are named."""
 
@@ -36,10 +38,12 @@ def detect_format(drive: Path) -> str:
     """Name of the format of a drive, by its files; raises DataError for what is no drive."""
     endings = {ending: name for name, reader in readers().items() for ending in getattr(reader, "FILES", ())}
     if not drive.is_dir() and is_file(drive):
-        if drive.suffix in endings:
-            return endings[drive.suffix]
+        if drive.suffix.lower() in endings:
+            return endings[drive.suffix.lower()]
+        more = "; unpack it" if drive.suffix.lower() in ARCHIVES else ""
         raise DataError(
-            f"{shown(drive)}: found a file, expected the folder of a drive, or a file ending in {', '.join(endings)}"
+            f"{shown(drive)}: found a file, expected the folder of a drive, or a file ending in"
+            f" {', '.join(endings)}{more}"
         )
     if not is_folder(drive):
         raise DataError(f"{shown(drive)}: no such folder; expected a drive")
@@ -56,7 +60,16 @@ def detect_format(drive: Path) -> str:
         )
     found = [shown(path.name) for path in inside(drive)][:8]
     signs = ", or ".join(f"{reader.SIGNS}" for reader in readers().values())
-    raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}")
+    packed = archives_in(drive)
+    way = (
+        f"; unpack {', '.join(packed)}" if packed else "; other data: write a CSV log (docs/your_own_log.md)"
+    )
+    raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}{way}")
+
+
+def archives_in(folder: Path) -> list[str]:
+    """Names of the archives in a folder, which nothing is read from."""
+    return [shown(path.name) for path in inside(folder) if path.suffix.lower() in ARCHIVES][:MOST_OFFERED]
 
 
 def drives_in(folder: Path, depth: int = 3) -> list[Path]:
@@ -85,6 +98,9 @@ def open_drive(
     `trajectory`: a file of poses in place of the drive's own, see `given_trajectory`.
     """
     log: SensorLog = _reader(Path(drive), drive_format).read(Path(drive), with_imu)
+    if not log.scans and Path(drive).is_dir() and (packed := archives_in(Path(drive))):
+        lost = Skip("scan", shown(drive), f"no scans, but archives: unpack {', '.join(packed)}", len(packed))
+        log = replace(log, skips=(*log.skips, lost))
     if trajectory is not None:
         return along(log, Path(trajectory), with_imu)
     log.check_located()

@@ -47,9 +47,9 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuSamples, WheelSpeeds, clean_imu, clean_wheels
 from factor_graphs.receiver_rows import MORE_COLUMNS
 from factor_graphs.surveyed_points import SurveyedPoints
-from factor_graphs.tables import layout_of
+from factor_graphs.tables import Column, layout_of
 from gnss_sem_map.datasets import frames
-from gnss_sem_map.datasets.gnss_files import read_gnss_file
+from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
 from gnss_sem_map.datasets.receiver import Receiver, measured
@@ -63,9 +63,15 @@ from gnss_sem_map.sensor_log.conventions import SensorConventions
 Array = NDArray[np.float64]
 MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
+SIDES = tuple("NSEWnsew")
+"""Letters of the hemispheres, behind a latitude or longitude or in a column of their own."""
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
 STAMPS = "stamps.csv"
+HOW_TO_WRITE = {
+    "scan": "; numpy.column_stack([x, y, z, intensity, time]).astype('<f4').tofile(NAME) writes one",
+    "image": ", or .jpg: convert them",
+}
 UNIT_KEYS = {"ax": "force_unit", "wx": "rate_unit", "speed_mps": "speed_unit"}
 FORMAT, SIGNS = "table", "imu.csv and gnss.csv, or lidar/stamps.csv (CSV log)"
 
@@ -144,26 +150,43 @@ def _missing(path: Path, columns: tuple[str, ...]) -> Skip:
 
 def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Array, list[Skip]]:
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
-    path, skips = drive / "gnss.csv", []
-    if about.gnss_file is None:
-        try:
-            given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
-        except DataError as error:
-            other = f"a table without deviations, or above a geoid: `gnss_file: {{path: {path.name}}}` in log.yaml"
-            raise DataError(f"{error}; {other}") from None
-    elif is_file(path) and about.gnss_file.path != path.name:
+    path, skips, file = drive / "gnss.csv", list[Skip](), about.gnss_file
+    if file is not None and is_file(path) and file.path != path.name:
         raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
+    if file is None and not _is_of_our_columns(path):
+        file = GnssFile(path=path.name)
+    if file is None:
+        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
     else:
-        path = drive / about.gnss_file.path
+        path = drive / file.path
         span_ns = None
         if imu_stamps is not None:
             first, last = about.epoch_ns + np.round(imu_stamps[[0, -1]] * 1e9).astype(np.int64)
             span_ns = int(first), int(last)
-        found = read_gnss_file(about.gnss_file, drive, about.epoch_ns, span_ns)
+        try:
+            found = read_gnss_file(file, drive, about.epoch_ns, span_ns)
+        except DataError as error:
+            if about.gnss_file is not None:
+                raise
+            raise DataError(
+                f"{error}; such keys are of `gnss_file: {{path: {path.name}}}` in log.yaml"
+            ) from None
         given, skips = found.rows, found.skips
     with _as_data_error():
         rows, invalid = fix_rows(given, shown(path))
     return rows, skips + [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
+
+
+def _is_of_our_columns(path: Path) -> bool:
+    """Whether a table has all columns of gnss.csv, as numbers; another is read as other programs write positions."""
+    try:
+        layout = layout_of(_content(path, GNSS_COLUMNS), GNSS_COLUMNS, MORE_COLUMNS)
+        found = [layout.column(name) for name in GNSS_COLUMNS]
+    except (DataError, MeasurementError):
+        return True  # told by the usual reader
+    angles = [one.at for one in found[1:3] if one is not None]
+    has_sides = any(layout.first(at)[-1:] in SIDES or layout.first(at + 1) in SIDES for at in angles)
+    return not any(found) or (None not in found and not has_sides)
 
 
 def _wheels(path: Path, about: LogFile) -> tuple[WheelSpeeds | None, list[Skip]]:
@@ -190,12 +213,19 @@ def _numbers(
     with _as_data_error():
         content = _content(path, columns)
         for name, key in UNIT_KEYS.items():
-            column = layout_of(content, columns).column(name) if name in columns else None
+            column = _column(content, columns, name, shown(path)) if name in columns else None
             if column is not None and column.scale != 1.0 and getattr(about, key) is not None:
                 raise DataError(
                     f"{shown(path)}: the unit of {name} is in its header, and {key} in log.yaml; remove {key}"
                 )
         return parse_numbers(content, columns, shown(path), longest_step_s, more, about.epoch_ns)
+
+
+def _column(content: bytes, columns: tuple[str, ...], name: str, where: str) -> Column | None:
+    try:
+        return layout_of(content, columns).column(name)
+    except MeasurementError as error:
+        raise DataError(f"{where}: {error}") from None
 
 
 def _content(path: Path, columns: tuple[str, ...]) -> bytes:
@@ -219,7 +249,13 @@ def _stamps(path: Path, what: str, epoch_ns: int) -> tuple[dict[int, float], lis
     """
     columns = {"number": "string", "stamp_s": "float64"}
     with _as_data_error():
-        table = parse_columns(_content(path, tuple(columns)), columns, shown(path), epoch_ns)
+        table = parse_columns(
+            _content(path, tuple(columns)),
+            columns,
+            shown(path),
+            epoch_ns,
+            longest_step_s=LONGEST_FRAME_STEP_S,
+        )
     texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
     check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
     stamps: dict[int, float] = {}
@@ -252,8 +288,10 @@ def _stamped(
     """Number, stamp and file of every frame that has a stamp and a file; and the skipped frames."""
     found = frames.numbered(what, folder, *suffixes)
     if not found.files and is_folder(folder) and (n := sum(path.name != STAMPS for path in inside(folder))):
+        endings = sorted({path.suffix for path in inside(folder) if path.name != STAMPS} - {*suffixes})[:5]
         name = f"{what}s are named by their numbers, such as 0000000007{suffixes[0]}"
-        found.skips.append(Skip(what, shown(folder), f"found {n} others; {name}", n))
+        others, way = (f" ({', '.join(endings)})", HOW_TO_WRITE[what]) if endings else ("", "")
+        found.skips.append(Skip(what, shown(folder), f"found {n} others{others}; {name}{way}", n))
     if not found.files and not is_file(folder / STAMPS):
         return [], found.skips
     stamps, skips = _stamps(folder / STAMPS, what, epoch_ns)

@@ -143,10 +143,11 @@ def refuse_other_bytes(rows: NDArray[np.float32], where: str) -> None:
 
 
 def scale_intensity(rows: NDArray[np.float32], intensity_max: float) -> None:
-    """Divide the fourth column of points (n, 4 or more) by the number that stands for an intensity of 1."""
+    """Divide the fourth column of points (n, 4 or more) by the number that stands for an intensity of 1; NaN is 0."""
     if intensity_max != 1:
         with np.errstate(over="ignore", invalid="ignore"):  # of damaged points
             rows[:, 3] = rows[:, 3] / np.float64(intensity_max)
+    np.copyto(rows[:, 3], 0.0, where=np.isnan(rows[:, 3]))
 
 
 def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:

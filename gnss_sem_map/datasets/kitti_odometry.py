@@ -18,7 +18,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import frames, kitti_calibration
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, read_text, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
 
@@ -44,8 +44,9 @@ def read(sequence: Path, with_imu: bool = True) -> SensorLog:
     """Open an odometry sequence; raises DataError when calibration, poses or times are missing or malformed."""
     file = sequence / "calib.txt"
     camera = next((n for n in CAMERAS if is_folder(sequence / f"image_{n}")), CAMERAS[0])
-    rows = kitti_calibration.read_rows(file, {f"P{camera}": 12, "Tr": 12})
-    Tr = rows["Tr"].reshape(3, 4)
+    name = "Tr_velo_to_cam" if is_file(file) and "Tr_velo_to_cam:" in read_text(file) else "Tr"
+    rows = kitti_calibration.read_rows(file, {f"P{camera}": 12, name: 12})
+    Tr = rows[name].reshape(3, 4)
     Tr = kitti_calibration.transform(Tr[:, :3], Tr[:, 3], f"{shown(file)}: Tr")
     times = _times(sequence / "times.txt")
     poses = _poses(_poses_file(sequence))
@@ -172,7 +173,14 @@ def _read_compensated(path: Path, state: frames.State | None) -> Points:
 def read_table(path: Path, columns: int) -> Array:
     """Rows (n, columns) of numbers, without comments; raises DataError, with the line, for anything else."""
     if not is_file(path):
-        raise DataError(f"{shown(path)}: missing; expected one line of {columns} numbers per frame")
+        raise DataError(
+            f"{shown(path)}: missing; expected one line of {columns} numbers per frame"
+            + (
+                "; it comes with the calibration of the data set (data_odometry_calib.zip)"
+                if columns == 1
+                else ""
+            )
+        )
     rows = []
     for number, line in enumerate(read_lines(path), 1):
         words = line.partition("#")[0].split()

@@ -84,7 +84,10 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     unit = navigation(drive, _twins(drive), with_imu)
     epoch_ns = unit.epoch_ns
     scans, scan_skips = _scans(drive, epoch_ns)
-    images, image_skips = _images(drive / f"image_{camera}", epoch_ns, calibration.image_sizes.get(""))
+    of_scans = {scan.number: epoch_ns + round(scan.stamp * 1e9) for scan in scans}
+    images, image_skips = _images(
+        drive / f"image_{camera}", epoch_ns, calibration.image_sizes.get(""), of_scans
+    )
     return SensorLog(
         name=shown(drive.name or drive.resolve().name),
         epoch_ns=epoch_ns,
@@ -156,9 +159,15 @@ def navigation(drive: Path, twins: tuple[Path, ...], with_imu: bool = True) -> N
 
 
 def date_folder(drive: Path) -> Path:
-    """The folder with the calibration: beside the drive, or, if `drive` is a link or `.`, beside its target."""
-    has_calibration = is_file(drive.parent / IMU_TO_LIDAR)
-    return drive.parent if has_calibration else drive.resolve().parent
+    """The folder with the calibration: beside the drive, or, if `drive` is a link or `.`, beside its target.
+
+    Else in the drive, or above it, as it may be unpacked.
+    """
+    whole = drive.resolve()
+    date = whole.name[:10]
+    places = [drive.parent, whole.parent, drive, whole.parent.parent]
+    places += [place / f"{date}_calib" / date for place in (whole.parent, whole.parent.parent)]
+    return next((place for place in places if is_file(place / IMU_TO_LIDAR)), whole.parent)
 
 
 def _camera(drive: Path) -> str:
@@ -369,9 +378,9 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     found = frames.numbered("scan", folder / "data", *frames.SCAN_SUFFIXES)
     if not found.files:
         return (), found.skips + _all_missing("scan", folder)
-    (middle, skips), (start, in_start), (end, in_end) = (
-        stamps_ns(folder / f"timestamps{part}.txt") for part in ("", "_start", "_end")
-    )
+    middle, skips = stamps_ns(folder / "timestamps.txt")
+    start, in_start = _ends_of_sweeps(folder / "timestamps_start.txt", middle, -0.5)
+    end, in_end = _ends_of_sweeps(folder / "timestamps_end.txt", middle, 0.5)
     skips += in_start + in_end + found.skips + frames.missing("scan", folder, middle, found.files)
     scans = []
     for number, path in found.files.items():
@@ -386,6 +395,17 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
             read = partial(read_sweep, path, stamp, begun, ended, frames.state_of(path))
             scans.append(Scan(path.stem, number, stamp, read, (begun, ended)))
     return in_order("scan", scans, skips), skips
+
+
+def _ends_of_sweeps(path: Path, middle: dict[int, int], share: float) -> tuple[dict[int, int], list[Skip]]:
+    """Starts or ends of sweeps, ns; without a file, so much of the usual step from their middle."""
+    if is_file(path) or len(middle) < 2:
+        return stamps_ns(path)
+    shift = round(share * float(np.median(np.diff(sorted(middle.values())))))
+    told = f"missing: {len(middle)} sweeps are taken to fill the time between their stamps"
+    return {number: stamp + shift for number, stamp in middle.items()}, [
+        Skip("stamps", shown(path), told, len(middle))
+    ]
 
 
 def read_sweep(path: Path, stamp: float, start: float, end: float, state: frames.State | None) -> Points:
@@ -410,12 +430,12 @@ def seconds_after(rows: NDArray[np.float32], stamp: float, start: float, end: fl
 
 
 def _images(
-    folder: Path, epoch_ns: int, size: tuple[int, int] | None
+    folder: Path, epoch_ns: int, size: tuple[int, int] | None, of_scans: dict[int, int]
 ) -> tuple[tuple[Image, ...], list[Skip]]:
     found = _image_files(folder)
     if not found.files:
         return (), found.skips + _all_missing("image", folder)
-    return stamped_images(found, folder, epoch_ns, size)
+    return stamped_images(found, folder, epoch_ns, size, of_scans=of_scans or None)
 
 
 def stamped_images(

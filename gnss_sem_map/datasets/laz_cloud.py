@@ -27,7 +27,7 @@ from gnss_sem_map.scans.local_maps import CUBE_M
 if TYPE_CHECKING:
     from laspy import LasHeader
 
-WGS84_3D_EPSG = 4979
+WGS84_EPSG, WGS84_3D_EPSG = 4326, 4979
 CHUNK_BYTES = 32 << 20
 """Of points read at a time; of each chunk the means of its cubes stay."""
 VERTICAL_CRS, VERTICAL_UNIT = 4096, 4099
@@ -47,7 +47,7 @@ def read_base(path: Path, frame: LocalFrame, geoid: Path | None = None) -> BaseC
     import laspy
     import lazrs
 
-    parts: list[NDArray[np.float64]] = [np.empty((0, 3))]
+    parts, given = [np.empty((0, 3))], 0
     try:
         with (
             os.fdopen(open_file(path), "rb") as file,
@@ -59,6 +59,7 @@ def read_base(path: Path, frame: LocalFrame, geoid: Path | None = None) -> BaseC
                 some = (
                     points[~np.asarray(points.withheld, np.bool_)] if hasattr(points, "withheld") else points
                 )
+                given += len(some)
                 placed = placing.of_points(some.x, some.y, some.z)
                 parts.append(one_per_cube(np.ascontiguousarray(placed[_is_near(placed)]), CUBE_M))
     except DataError:
@@ -67,12 +68,18 @@ def read_base(path: Path, frame: LocalFrame, geoid: Path | None = None) -> BaseC
         laspy.errors.LaspyException, lazrs.LazrsError, ProjError, OSError, ValueError, IndexError, struct.error,
     ) as error:  # fmt: skip
         reason = one_line(error)
-        raise DataError(f"{shown(path)}: cannot be read as LAS or LAZ ({reason})") from None
+        raise DataError(
+            f"{shown(path)}: cannot be read as LAS or LAZ ({reason}); is it damaged? other formats: pdal translate IN"
+            " OUT.laz"
+        ) from None
     points = np.concatenate(parts)
+    if not given:
+        raise DataError(f"{shown(path)}: holds no points, or all are withheld; expected a cloud of the place")
     if not len(points):
         raise DataError(
             f"{shown(path)}: found no point within {MOST_M / 1000:g} km of the origin {frame.lat_deg:.4f},"
-            f" {frame.lon_deg:.4f}; expected a cloud of the same place"
+            f" {frame.lon_deg:.4f}; expected a cloud of the same place: is its coordinate system the one it is in, with"
+            " eastings before northings?"
         )
     return BaseCloud(path.name, one_per_cube(points, CUBE_M))
 
@@ -93,18 +100,21 @@ class _Placing:
         """Raises DataError for a file without a coordinate system, or heights above a geoid that PROJ has not."""
         crs, unit_m = _crs_of(header), None
         if crs is None:
-            raise DataError(f"{shown(path)}: has no coordinate system; expected a georeferenced LAS or LAZ")
+            raise DataError(
+                f"{shown(path)}: has no coordinate system; expected a georeferenced LAS or LAZ; write it into the file"
+                " (pdal translate IN.laz OUT.laz --writers.las.a_srs=EPSG:25832, or the code of yours)"
+            )
         for key in _geo_keys(header):
             unit_m = UNIT_M.get(key.value_offset, unit_m) if key.id == VERTICAL_UNIT else unit_m
         if not crs.is_compound:
             axes = crs.axis_info
             if unit_m is None:  # none of its own: that of the coordinates
                 unit_m = axes[0].unit_conversion_factor if crs.is_projected and len(axes) == 2 else 1.0
-            return cls(frame, Transformer.from_crs(crs.to_3d(), WGS84_3D_EPSG, always_xy=True), unit_m, None)
+            return cls(frame, _to_wgs84(crs), unit_m, None)
         vertical = crs.sub_crs_list[-1]
         axis_m = vertical.axis_info[0].unit_conversion_factor
         unit_m = axis_m if unit_m is None else unit_m
-        flat = Transformer.from_crs(crs.sub_crs_list[0].to_3d(), WGS84_3D_EPSG, always_xy=True)
+        flat = _to_wgs84(crs.sub_crs_list[0])
         found = _by_grids(crs, flat, frame)
         if found is not None:
             return cls(frame, found, unit_m / axis_m, None)
@@ -121,6 +131,11 @@ class _Placing:
         if self.geoid is not None:
             *_, alt_m = undulation(self.geoid).transform(lon_deg, lat_deg, alt_m, direction="INVERSE")
         return self.frame.to_map(lat_deg, lon_deg, alt_m)
+
+
+def _to_wgs84(crs: CRS) -> Transformer:
+    """Heights of a system of two axes stay: they are above no ellipsoid of it, which may be 50 m off."""
+    return Transformer.from_crs(crs, WGS84_3D_EPSG if len(crs.axis_info) == 3 else WGS84_EPSG, always_xy=True)
 
 
 def _by_grids(crs: CRS, flat: Transformer, frame: LocalFrame) -> Transformer | None:

@@ -30,7 +30,7 @@ MOST_DIMENSIONS = 32
 CHUNK_BYTES = 1 << 18
 KINDS_OF_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 HEADER = re.compile(
-    r"\{'descr': '([<>|=]?[biufcU]\d{1,6})', 'fortran_order': (True|False),"
+    r"\{'descr': '([<>|=]?[biufcUS]\d{1,6})', 'fortran_order': (True|False),"
     r" 'shape': \(((?:\d{1,18}, ?)*\d{0,18})\),? ?\}\s*"
 )
 """Format of the header that numpy writes; nothing in it is evaluated."""
@@ -155,7 +155,10 @@ def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]
     length = int.from_bytes(file.read(words), "little")
     if length > MOST_HEADER_BYTES:
         raise ValueError(f"a header of {length} bytes")
-    found = HEADER.fullmatch(file.read(length).decode("latin1"))
+    header = file.read(length).decode("latin1")
+    found = HEADER.fullmatch(header)
+    if found is None and "'|O'" in header:
+        raise ValueError("Python objects, which are not read: save names as numpy.array(names, str)")
     if found is None:
         raise ValueError("no plain array")
     shape = tuple(int(side) for side in found[3].replace(" ", "").split(",") if side)

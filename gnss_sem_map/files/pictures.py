@@ -62,7 +62,7 @@ def decoded_picture(
 
 @dataclass(frozen=True, eq=False)
 class LabelPixels:
-    """The values of a label image: grey ones are ids, colours are colours, those by a palette may be either."""
+    """The values of a label image: grey ones are ids, colours are colours, by a palette or of equal parts either."""
 
     ids: NDArray[Any] | None
     """(h, w), uint8 or uint16."""
@@ -88,7 +88,10 @@ def read_labels(path: Path) -> LabelPixels:
             step = 255 // (2**depth - 1) if depth > 1 else 1
             return LabelPixels(np.array(whole, np.uint8) // np.uint8(step), None)
         red, green, blue, _ = np.array(picture.convert("RGBA"), np.int32).transpose(2, 0, 1)
-        return LabelPixels(np.array(picture) if picture.mode == "P" else None, red << 16 | green << 8 | blue)
+        ids = np.array(picture) if picture.mode == "P" else None
+        if ids is None and (red == green).all() and (red == blue).all():  # grey, saved as colours
+            ids = red.astype(np.uint8)
+        return LabelPixels(ids, red << 16 | green << 8 | blue)
 
 
 @contextmanager

@@ -114,7 +114,9 @@ def read_text(path: Path, most: int = MOST_TEXT_BYTES, error: type[SemMapError] 
 
 def read_lines(path: Path) -> list[str]:
     """Lines of a text file, with limits on their number and length; raises DataError."""
-    lines = read_bytes(path, MOST_TEXT_BYTES).decode("utf-8", "replace").split("\n")
+    content = read_bytes(path, MOST_TEXT_BYTES)
+    is_wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    lines = content.decode("utf-16" if is_wide else "utf-8-sig", "replace").split("\n")
     if len(lines) > MOST_LINES or max(map(len, lines)) > LONGEST_LINE:
         raise DataError(
             f"{shown(path)}: found {len(lines)} lines of up to {max(map(len, lines))} characters, expected at most"

@@ -143,18 +143,32 @@ def read_probabilities(
     """The probabilities (h, w, c) and class names (c,) of one `.npz`; raises DataError for anything else in it."""
     with open_archive(path) as archive:
         stored, named = archive.array("probabilities"), archive.array("class_names", MOST_NAME_BYTES)
-        if len(named.shape) != 1 or named.dtype.kind != "U":
+        if len(named.shape) != 1 or named.dtype.kind not in "US":
             raise DataError(
                 f"{shown(path)}: found class_names of {named.dtype} {named.shape}, expected a list of names"
             )
-        check_shape(stored.shape, stored.dtype, named.shape[0], shown(path))
+        axes = _axes(stored.shape, named.shape[0])
+        shape = tuple(stored.shape[axis] for axis in axes)
+        check_shape(shape, stored.dtype, named.shape[0], shown(path))
         if expected_size is not None:
-            shrink_of(stored.shape, expected_size, shown(path))
+            shrink_of(shape, expected_size, shown(path))
         try:
-            names = tuple(map(str, named.read()))
+            names = tuple(map(str, named.read().astype(np.str_)))
         except ValueError:
             raise DataError(f"{shown(path)}: class_names are no text") from None
-        return checked_probabilities(stored.read(), len(names), shown(path)), names
+        values = stored.read()
+        values = values.reshape(values.shape[-3:]).transpose([axis - values.ndim + 3 for axis in axes])
+        return checked_probabilities(np.ascontiguousarray(values), len(names), shown(path)), names
+
+
+def _axes(shape: tuple[int, ...], classes: int) -> list[int]:
+    """Which axes are rows, columns and classes: (h, w, c), or as networks have it (c, h, w), of a batch of one."""
+    axes = list(range(len(shape)))
+    if len(shape) == 4 and shape[0] == 1:
+        axes = axes[1:]
+    if len(axes) == 3 and shape[axes[0]] == classes != shape[axes[2]]:
+        axes = [*axes[1:], axes[0]]
+    return axes
 
 
 def _label_files(

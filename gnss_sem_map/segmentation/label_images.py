@@ -21,10 +21,15 @@ COLOUR = "colour"
 MARKS = {"labelTrainIds": "train_id", "labelIds": "label_id", "color": COLOUR, "instanceIds": "label_id"}
 """What the names of Cityscapes' files say, and so those of tools that follow it; the best one first."""
 
+TIME = re.compile(r"\d{9,}\.\d+")
+"""A name that is Unix time, s."""
 VOID, UNKNOWN = 255, 254
 """Codes of pixels without a class, and of values that nobody knows; other codes are columns of the evidence."""
 ENOUGH = 0.1
 """Ids that fit two kinds are of the one that gives so much more of the pixels a class of the map."""
+ROAD = "road"
+LEAST_ROAD, LOWEST_ROAD = 0.005, 0.4
+"""Of the images of a drive, roads are a larger part; and their middle lies lower, as a share of the height."""
 LOOKED_AT = 1 << 18
 """Pixels of an image that are looked at to find out what the values mean."""
 
@@ -97,13 +102,38 @@ def meaning_of(
     )
     if readings[best[0]].kind == COLOUR or means[0][0] == 0:
         return readings[best[0]]
+    ids = [one.ids.ravel() for one in pictures if one.ids is not None]
+    found = f"{asked}: its ids {np.unique(np.concatenate(ids))[:20].tolist()} fit"
     if len(best) == 1 or means[0][0] - means[1][0] >= ENOUGH:
-        return readings[-means[0][1]]
-    kinds, ids = [readings[i].kind for i in best], [one.ids for one in pictures if one.ids is not None]
+        chosen = readings[-means[0][1]]
+        if name is None and kind is None and (why := _odd_road(chosen, pictures, label_set)):
+            raise ConfigError(
+                f"{found} {chosen.kind} of {chosen.source.name}, but then {why}; are they of another data set? say so"
+                f" by ?taxonomy=camvid, mapillary, ade20k or a YAML file, or ?ids={chosen.kind} if they are these"
+            )
+        return chosen
+    kinds = [readings[i].kind for i in best]
     raise ConfigError(
-        f"{asked}: its ids {np.unique(np.concatenate(ids))[:20].tolist()} fit {' as well as '.join(kinds)} of"
-        f" {readings[best[0]].source.name}; say which they are with {' or '.join(f'?ids={one}' for one in kinds)}"
+        f"{found} {' as well as '.join(kinds)} of {readings[best[0]].source.name}; say which they are with"
+        f" {' or '.join(f'?ids={one}' for one in kinds)}, or ?taxonomy="
     )
+
+
+def _odd_road(reading: Meaning, pictures: Sequence[LabelPixels], label_set: LabelSet) -> str:
+    """What is odd about the roads of a drive by these ids; empty where nothing is, or the map has no such class."""
+    if ROAD not in label_set.names:
+        return ""
+    code, roads, heights = label_set.names.index(ROAD), [], []
+    for one in pictures:
+        if one.ids is not None:
+            rows = (reading.codes[reading.values(one, "")] == code).mean(axis=1)
+            roads.append(rows.mean())
+            heights.append(rows @ (np.arange(len(rows)) + 0.5) / len(rows) / max(rows.sum(), 1e-9))
+    share = float(np.mean(roads))
+    if share < LEAST_ROAD:
+        return f"{share:.1%} of the pixels are {ROAD}"
+    middle = float(np.average(heights, weights=roads))
+    return f"the middle of the {ROAD} lies {middle:.0%} down the images" if middle < LOWEST_ROAD else ""
 
 
 def none_usable(refused: Sequence[DataError]) -> DataError:
@@ -113,11 +143,14 @@ def none_usable(refused: Sequence[DataError]) -> DataError:
 
 
 def _some(pixels: LabelPixels) -> LabelPixels:
-    """At most LOOKED_AT of the pixels, at equal steps, (k,)."""
-    ids, colours = (
-        None if v is None else v.ravel()[:: -(-v.size // LOOKED_AT)] for v in (pixels.ids, pixels.colours)
-    )
+    """At most LOOKED_AT of the pixels, at equal steps."""
+    ids, colours = (None if v is None else _thinned(v) for v in (pixels.ids, pixels.colours))
     return LabelPixels(ids, colours)
+
+
+def _thinned(values: NDArray[Any]) -> NDArray[Any]:
+    step = int(np.ceil(np.sqrt(values.size / LOOKED_AT)))
+    return values[::step, ::step]
 
 
 def reading(source: Taxonomy, label_set: LabelSet, kind: str, highest: int = 0) -> Meaning:
@@ -189,6 +222,11 @@ def _only(patterns: dict[str, list[Path]]) -> list[Path]:
 
 
 def _numbers(paths: list[Path]) -> dict[int, Path]:
+    if all(TIME.fullmatch(path.stem) for path in paths):
+        raise DataError(
+            f"{shown(paths[0])}: named by a time, as {len(paths)} files are; expected the number of the frame: rename"
+            " them"
+        )
     columns = np.array([re.findall(r"\d+", path.stem) for path in paths], object).T
     differ = [column for column in columns if len(set(column)) > 1]
     chosen = differ[-1] if differ else max(columns, key=lambda column: len(column[0]))

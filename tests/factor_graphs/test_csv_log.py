@@ -144,7 +144,7 @@ def test_rows_out_of_order_are_sorted_and_counted(log):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda h, r: (h.replace("stamp_s", "when"), r), r"column stamp_s is missing .* in when,ax.*expected numbers"),
+        (lambda h, r: (h.replace("stamp_s", "when"), r), r"no column stamp_s in when,ax.*expected numbers"),
         (lambda h, r: (h.replace("wz", "wy"), r), "column wy is missing or repeated"),
         (lambda h, r: (h.replace("ax", "ax [furlong]"), r), r"column 'ax \[furlong\]' is in a unit that is not known"),
         (lambda h, r: (h, [[*c[:3], "n/k", *c[4:]] for c in r]), "Row #2.*invalid value 'n/k'.*expected numbers"),
@@ -193,5 +193,5 @@ def test_wheel_speeds_are_read_exactly_or_repaired_with_a_count_or_refused(log):
     with pytest.warns(RepairWarning, match=r"wheels.csv: wheels: 3 rows; 1 not finite, dropped"):
         np.testing.assert_array_equal(read_wheels(log).speeds, [2.5, -3.0])
     (log / "wheels.csv").write_text("when,speed_mps\n0,1\n")
-    with pytest.raises(MeasurementError, match=r"wheels.csv: column stamp_s is missing"):
+    with pytest.raises(MeasurementError, match=r"wheels.csv: found no column stamp_s"):
         read_wheels(log)

@@ -11,7 +11,7 @@ import pytest
 from factor_graphs import csv_log
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS, parse_numbers
 from factor_graphs.errors import MeasurementError
-from factor_graphs.tables import NAMES, UNITS, layout_of
+from factor_graphs.tables import ACROSS, NAMES, UNITS, layout_of
 
 EPOCH_NS = 1_777_000_000_000_000_000
 ROWS = np.column_stack([np.arange(5) * 0.01, np.random.default_rng(0).normal(size=(5, 6)).round(6)])
@@ -41,6 +41,18 @@ def dated(rows: list[list[str]], form: Callable[[np.datetime64], str]) -> list[l
         return form(np.datetime64(EPOCH_NS + round(float(seconds) * 1e9), "ns"))
 
     return [[text(row[0]), *row[1:]] for row in rows]
+
+
+def day_first(moment: np.datetime64, by: str) -> str:
+    day, clock = str(moment).split("T")
+    return f"{by.join(day.split('-')[::-1])} {clock}"
+
+
+def american(moment: np.datetime64) -> str:
+    day, clock = str(moment).split("T")
+    year, month, number = day.split("-")
+    hour = int(clock[:2])
+    return f"{month}/{number}/{year} {(hour - 1) % 12 + 1}{clock[2:]} {'AM' if hour < 12 else 'PM'}"
 
 
 SAME: dict[str, Change] = {
@@ -91,6 +103,36 @@ SAME: dict[str, Change] = {
     "ISO times west of Greenwich": lambda h, r: joined(
         h, dated(r, lambda t: f"{str(t - np.timedelta64(210, 'm')).replace('-', '/')}-0330")
     ),
+    "EuRoC": lambda h, r: joined(
+        [
+            "#timestamp [ns]",
+            *(f"a_RS_S_{x} [m s^-2]" for x in "xyz"),
+            *(f"w_RS_S_{x} [rad s^-1]" for x in "xyz"),
+        ],
+        scaled(r, slice(0, 1), 1e9),
+    ),
+    "paths of topics": lambda h, r: joined(
+        ["__time", *(f"/imu/data/linear_acceleration/{x}" for x in "xyz")]
+        + [f"/imu.angular_velocity.{x}" for x in "xyz"],
+        r,
+    ),
+    "the sensor before the names": lambda h, r: joined(
+        ["imu_time", *(f"imu.acc.{x}" for x in "xyz"), *(f"imu_gyro_{x}" for x in "xyz")], r
+    ),
+    "seconds and nanoseconds": lambda h, r: joined(
+        ["header.stamp.sec", "header.stamp.nanosec", *h[1:]],
+        [[row[0].partition(".")[0], row[0].partition(".")[2] + "000", *row[1:]] for row in r],
+    ),
+    "milliseconds without a unit": lambda h, r: joined(["timestamp", *h[1:]], scaled(r, slice(0, 1), 1e3)),
+    "microseconds without a unit": lambda h, r: joined(["timestamp", *h[1:]], scaled(r, slice(0, 1), 1e6)),
+    "dates of Germany": lambda h, r: joined(h, dated(r, lambda t: day_first(t, "."))),
+    "dates with names of months": lambda h, r: joined(
+        h, dated(r, lambda t: day_first(t, "-").replace("-04-", "-Apr-"))
+    ),
+    "dates of America, by the half of the day": lambda h, r: joined(h, dated(r, american)),
+    "date and time apart": lambda h, r: joined(
+        ["Date", "Time", *h[1:]], [[*row[0].split("T"), *row[1:]] for row in dated(r, str)]
+    ),
     "ISO times and decimal commas": lambda h, r: joined(
         h, [commas(row) for row in dated(r, lambda t: str(t)[:-3])], ";"
     ),
@@ -133,15 +175,51 @@ def test_speeds_have_their_unit(header: str, by: float) -> None:
         "Time,Latitude,Longitude,Altitude,sdE,sdN,sdU",
         "time (s),lat (deg),lng [°],height [m],std_e [m],std_n [m],std_u [m]",
         "t,LAT,LON,H-Ell,SDEast,SDNorth,SDHeight",
+        "gps_time,gps.latitude,gps.longitude,Alt (HAE),sd_east,sd_north,vertical_accuracy",
+        "%time,field.latitude,field.longitude,field.altitude,field.position_covariance0,field.position_covariance4,"
+        "field.position_covariance8",
         "seconds;latitude_rad;longitude_rad;alt_mm;std_east_cm;std_north_cm;std_up_cm",
     ],
 )
 def test_positions_have_the_names_of_others(header: str) -> None:
     row = np.array([1.0, 49.0, 8.4, 160.25, 0.01, 0.02, 0.03])
     given = row / [1, 180 / np.pi, 180 / np.pi, 1e-3, 1e-2, 1e-2, 1e-2] if "rad" in header else row
+    given = np.append(given[:4], given[4:] ** 2) if "covariance" in header else given
     by = ";" if ";" in header else ","
     content = header.replace("seconds", "time_s") + "\n" + by.join(f"{v:.15g}" for v in given) + "\n"
     np.testing.assert_allclose(parse_numbers(content.encode(), GNSS_COLUMNS, "gnss.csv", 100.0), row[None])
+
+
+@pytest.mark.parametrize("name", ["hAcc", "horizontal_accuracy"])
+def test_one_horizontal_accuracy_is_that_of_east_and_north(name: str) -> None:
+    content = f"time,lat,lon,height,{name},vAcc\n1,49,8.4,160,0.5,0.8\n".encode()
+    found = parse_numbers(content, GNSS_COLUMNS, "gnss.csv", 100.0)
+    np.testing.assert_array_equal(found, [[1, 49, 8.4, 160, 0.5, 0.5, 0.8]])
+
+
+def test_times_of_day_go_on_over_midnight() -> None:
+    content = joined(
+        ["time", "speed"], [["23:59:59.5", "1"], ["23:59:59.75", "1"], ["00:00:00", "1"]]
+    ).encode()
+    found = parse_numbers(content, ("stamp_s", "speed_mps"), "wheels.csv", 5.0)
+    np.testing.assert_allclose(found[:, 0] - found[0, 0], [0, 0.25, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"0.00,0.1,0,9.8,0,0,0\n0.01,0.1,0,9.8,0,0,0\n", "no line of names; write one"),
+        (b"PK\3\4\x14\0\6\0" + bytes(300), "is no text .*save it as CSV"),
+        (
+            joined(["time", *IMU_COLUMNS[1:]], [[str(k), *"123456"] for k in range(9)]).encode(),
+            "are these milli",
+        ),
+        (b"Zeit,ax,ay,az,wx,wy,wz\n0,0,0,0,0,0,0\n", "no column stamp_s .*name it so .*time"),
+    ],
+)
+def test_what_is_no_table_with_names_is_told_the_way_out(content: bytes, said: str) -> None:
+    with pytest.raises(MeasurementError, match=f"imu.csv: .*{said}"):
+        parse_numbers(content, IMU_COLUMNS, "imu.csv", 0.5)
 
 
 def test_a_date_that_no_calendar_has_is_a_row_without_a_stamp() -> None:
@@ -172,14 +250,14 @@ def test_two_columns_of_one_name_or_an_unknown_unit_are_refused(header: str, sai
 
 def test_no_name_is_that_of_two_columns_of_one_table() -> None:
     for table in (IMU_COLUMNS, GNSS_COLUMNS, csv_log.WHEEL_COLUMNS):
-        words = [word for name in table for word in NAMES[name]]
+        words = [word for name in table for word in NAMES[name] if word not in ACROSS.split()]
         assert len(words) == len(set(words))
     assert all(word == word.lower() for units in UNITS.values() for word in units)
 
 
 def test_a_file_on_disk_with_semicolons_is_read(tmp_path: Path) -> None:
     (tmp_path / "wheels.csv").write_text("Zeit [s];Geschwindigkeit\n", "utf-8")
-    with pytest.raises(MeasurementError, match="column stamp_s is missing"):
+    with pytest.raises(MeasurementError, match="no column stamp_s"):
         csv_log.read_wheels(tmp_path)
     (tmp_path / "wheels.csv").write_text("\ufefftime [s];speed [km/h]\n0,0;3,6\n0,1;7,2\n", "utf-8")
     speeds = csv_log.read_wheels(tmp_path)

@@ -1,4 +1,4 @@
-"""Positions of a receiver in a file of its own: RTKLIB .pos, NMEA, SBET, or a table with named columns.
+"""Positions of a receiver in a file of its own: RTKLIB .pos, NMEA, SBET, GPX, NovAtel, or a table with named columns.
 
 What it is, is told by its content. `GnssFile` says what the file does not: its clock, the height of the geoid, and how
 good its positions are. Positions become rows like those of gnss.csv, and errors of the clock are found where they leave
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.receiver_rows import with_more
-from gnss_sem_map.datasets.gnss_files import named_columns, nmea, rtklib, sbet
+from gnss_sem_map.datasets.gnss_files import named_columns, nmea, other_formats, rtklib, sbet
 from gnss_sem_map.datasets.gnss_files.positions import Positions
 from gnss_sem_map.datasets.gnss_files.time_systems import LEAP_S, gps_minus_utc_s
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.geoid import undulation
-from gnss_sem_map.files.untrusted import is_file, read_lines, shown
+from gnss_sem_map.files.untrusted import is_file, read_bytes, read_lines, shown
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -96,14 +96,19 @@ def read_gnss_file(
 def _read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
     """The positions of a file by the reader of its content."""
     ending = path.suffix.lower()
-    if ending in OF_SBET:
+    content = read_bytes(path)
+    if ending in OF_SBET or sbet.is_sbet(content):
         return sbet.read(path, near_ns, accuracy, has_stddevs)
     lines = read_lines(path)
     if rtklib.is_solution(lines):
         return rtklib.read(path, lines)
-    if ending in OF_NMEA or nmea.is_nmea(lines):
+    if nmea.is_nmea(lines) or (ending in OF_NMEA and content.startswith(b"$")):
         return nmea.read(path, lines, near_ns)
-    return named_columns.read(path, near_ns, has_stddevs)
+    if why := other_formats.no_positions(content):
+        raise DataError(f"{shown(path)}: {why}")
+    if ending in OF_NMEA:
+        return nmea.read(path, lines, near_ns)
+    return named_columns.read(path, other_formats.as_table(content), near_ns, has_stddevs)
 
 
 def _above_ellipsoid(path: Path, found: Positions, geoid: float | str | None, folder: Path) -> Positions:

@@ -16,14 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
-from factor_graphs.table_dates import DATE, seconds_of_dates, unix_scale
-from factor_graphs.tables import Column, Layout, layout_of
-from gnss_sem_map.datasets.gnss_files.positions import Positions, geodetic_of_ecef, thinned
+from factor_graphs.table_dates import are_dates, days_of, seconds_of_dates, unix_scale
+from factor_graphs.tables import NAMES, Column, Layout, layout_of
+from gnss_sem_map.datasets.gnss_files.positions import (
+    FLAT_STDDEV_M,
+    Positions,
+    geodetic_of_ecef,
+    thinned,
+    without_heights,
+)
 from gnss_sem_map.datasets.gnss_files.sbet import over_weeks
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, GPS_EPOCH_NS, WEEK_NS, nearest
-from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR
+from gnss_sem_map.datasets.stamps import LAST_YEAR
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import MOST_LINES, MOST_TEXT_BYTES, read_bytes, shown
+from gnss_sem_map.files.untrusted import MOST_LINES, shown
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -43,8 +49,8 @@ EXPECTED = (
 DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
 LARGEST, LATEST_S = 1e19, (LAST_YEAR - 1970) * 366 * DAY_S
 """No number of a table is larger, and no time of a drive is later."""
-MONTHS_FIRST = (2, 0, 1)
-"""Month, day, year, as Inertial Explorer has a date that does not begin with the year."""
+SIDES = {"lat_deg": ("N", "S"), "lon_deg": ("E", "W")}
+"""Letters of the hemispheres above and below zero, which may have a column of their own behind an angle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +78,18 @@ class _Table:
 
     def numbers(self, name: str) -> Array:
         """Numbers of a column in our units; NaN for what is none."""
-        return np.array([_number(text) for text in self.texts(name)]) * self.columns[name].scale
+        return self.columns[name].in_our_units(np.array([_number(text) for text in self.texts(name)]))
+
+    def beside(self, name: str) -> list[str]:
+        """The cells behind a column."""
+        at = self.columns[name].at + 1
+        rows = (line.split(self.layout.separator) for line in self.lines)
+        return ["".join(row[at : at + 1]).strip().strip('"').upper() for row in rows]
 
 
-def read(path: Path, near_ns: int | None, has_stddevs: bool) -> Positions:
+def read(path: Path, content: bytes, near_ns: int | None, has_stddevs: bool) -> Positions:
     """Positions of a table, at most ten a second; raises DataError where it is none, or tells no accuracy."""
-    table = _opened(path)
+    table = _opened(path, content)
     moments, system = _moments(table, near_ns, path)
     count, usable = len(moments), np.abs(moments) < LATEST_S
     rows = np.flatnonzero(usable)
@@ -87,14 +99,18 @@ def read(path: Path, near_ns: int | None, has_stddevs: bool) -> Positions:
     table = _Table(
         table.layout, table.columns, [table.lines[k] for k in rows.tolist()], table.are_angles_split
     )
-    if not table.has(*STDDEVS) and not has_stddevs:
+    is_flat = not ({"alt_m", "msl_m", "x_m"} & table.columns.keys())
+    told = STDDEVS[:2] if is_flat else STDDEVS
+    if not table.has(*told) and not has_stddevs:
         raise DataError(
             f"{shown(path)}: {table.layout.shown} does not tell its accuracy; set `stddevs_m: [east, north, up]`"
         )
     places, above_geoid = _places(table, path)
     stddevs = np.column_stack(
-        [table.numbers(name) if table.has(*STDDEVS) else np.ones(len(rows)) for name in STDDEVS]
+        [table.numbers(name) if table.has(*told, name) else np.ones(len(rows)) for name in STDDEVS]
     )
+    if is_flat:
+        stddevs[:, 2] = FLAT_STDDEV_M
     known = np.isfinite(places).all(axis=1) & np.isfinite(stddevs).all(axis=1)
     if not known.any():
         raise DataError(
@@ -102,14 +118,14 @@ def read(path: Path, near_ns: int | None, has_stddevs: bool) -> Positions:
         )
     lost += int((~known).sum())
     skips = [Skip("fix", shown(path), f"{lost} rows without a time or a place", lost)] if lost else []
+    skips += [without_heights(shown(path), int(known.sum()))] if is_flat else []
     stamps = np.round(moments[known] * 1e9).astype(np.int64)
     return Positions(
         stamps, places[known], stddevs[known], system, skips, above_geoid=np.full(len(stamps), above_geoid)
     )
 
 
-def _opened(path: Path) -> _Table:
-    content = read_bytes(path, MOST_TEXT_BYTES)
+def _opened(path: Path, content: bytes) -> _Table:
     try:
         layout = layout_of(content, NAMED)
         found = {name: layout.column(name) for name in NAMED}
@@ -121,7 +137,14 @@ def _opened(path: Path) -> _Table:
         raise DataError(f"{shown(path)}: found {len(lines)} lines, expected at most {MOST_LINES}")
     columns = {name: column for name, column in found.items() if column is not None}
     if not lines or not ({"lat_deg", "lat_d", "x_m"} & columns.keys()):
-        raise DataError(f"{shown(path)}: found {layout.shown or 'nothing'}; {EXPECTED}")
+        projected = {"easting_m", "northing_m"} & {name for name in NAMES if layout.column(name) is not None}
+        why = (
+            "eastings and northings; write latitude and longitude (cs2cs EPSG:... EPSG:4979)"
+            if projected
+            else ""
+        )
+        why = why or layout.missing("lat_deg", ("time", "latitude", "longitude", "altitude"))
+        raise DataError(f"{shown(path)}: {why if lines else 'empty'}; {EXPECTED}")
     if layout.decimal == ",":
         lines = [line.replace(",", ".") for line in lines]
     cells = len(lines[0].split(layout.separator))
@@ -133,8 +156,10 @@ def _places(table: _Table, path: Path) -> tuple[Array, bool]:
     if table.has(*GEOCENTRIC) and not table.has("lat_deg"):
         return geodetic_of_ecef(np.column_stack([table.numbers(name) for name in GEOCENTRIC])), False
     angles = [_angles(table, name) for name in ANGLES if table.has(name) or table.has(*PARTS[name])]
-    if len(angles) < len(ANGLES) or not ({"alt_m", "msl_m"} & table.columns.keys()):
+    if len(angles) < len(ANGLES):
         raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
+    if not ({"alt_m", "msl_m"} & table.columns.keys()):
+        return np.column_stack([*angles, np.zeros(len(table.lines))]), False
     if table.has("alt_m"):
         return np.column_stack([*angles, table.numbers("alt_m")]), False
     height = table.numbers("msl_m")
@@ -145,7 +170,12 @@ def _places(table: _Table, path: Path) -> tuple[Array, bool]:
 
 def _angles(table: _Table, name: str) -> Array:
     if table.has(name):
-        return np.array([_degrees(text) for text in table.texts(name)]) * table.columns[name].scale
+        degrees = table.columns[name].in_our_units(np.array([_degrees(text) for text in table.texts(name)]))
+        sides = np.array([] if table.are_angles_split else table.beside(name))
+        above, below = SIDES[name]
+        if len(sides) and np.isin(sides, (above, below)).all():
+            degrees = np.where(sides == below, -np.abs(degrees), degrees)
+        return degrees
     parts = zip(*(table.texts(part) for part in PARTS[name]), strict=True)
     return np.array([_degrees(" ".join(texts)) for texts in parts])
 
@@ -154,17 +184,17 @@ def _moments(table: _Table, near_ns: int | None, path: Path) -> tuple[Array, Sys
     """Times (n,), s since 1970 on their clock, NaN for what is none; and which clock it is."""
     if table.has("week", "sow"):
         return GPS_EPOCH_NS * 1e-9 + table.numbers("week") * WEEK_S + table.numbers("sow"), "gps"
-    name = next((name for name in ("sow", "clock", "stamp_s") if table.has(name)), None)
+    name = next((name for name in ("sow", "clock", "stamp_s", "date") if table.has(name)), None)
     if name is None:
         raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
     texts = table.texts(name)
     label = table.layout.header[table.columns[name].at].lower()
     is_gps = name == "sow" or label.startswith(("gps", "hr"))  # CSRS-PPP has GPS time
-    if any(map(DATE.fullmatch, texts[:100])):
-        return seconds_of_dates(texts, 0), "gps" if is_gps else "utc"
     clock = np.array([_clock(text) for text in texts])
+    if are_dates(texts) and np.isnan(clock).all():  # with the day
+        return seconds_of_dates(texts, 0), "gps" if is_gps else "utc"
     if table.has("date"):
-        days = _days(table.texts("date"))
+        days = days_of(table.texts("date"))
         sundays = days - (days / DAY_S + 4) % 7 * DAY_S
         return np.where(clock >= DAY_S, sundays, days) + clock, "gps" if is_gps else "utc"
     column = table.columns[name]
@@ -195,24 +225,6 @@ def _nearest(
     moments = np.full(len(clock), np.nan)
     moments[known] = nearest(start + np.round(times * 1e9).astype(np.int64), period, near_ns) * 1e-9
     return moments, "utc" if is_of_day else "gps"
-
-
-def _days(texts: list[str]) -> Array:
-    """Dates (n,) as s since 1970; one that does not begin with its year begins with the month, unless none does."""
-    parts = [[int(word) for word in re.findall(r"\d{1,4}", text)][:3] for text in texts]
-    first = max((part[0] for part in parts if len(part) == 3), default=0)
-    order = (0, 1, 2) if first > 31 else MONTHS_FIRST if first <= 12 else (2, 1, 0)
-    return np.array([_day(part, order) for part in parts])
-
-
-def _day(part: list[int], order: tuple[int, int, int]) -> float:
-    if len(part) < 3 or not FIRST_YEAR <= part[order[0]] <= LAST_YEAR:
-        return float("nan")
-    year, month, day = (part[k] for k in order)
-    try:
-        return float(np.datetime64(f"{year:04d}-{month:02d}-{day:02d}", "s").astype(np.int64))
-    except ValueError:
-        return float("nan")
 
 
 def _clock(text: str) -> float:

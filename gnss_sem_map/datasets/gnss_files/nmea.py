@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.datasets.gnss_files.positions import Positions
+from gnss_sem_map.datasets.gnss_files.positions import FLAT_STDDEV_M, Positions, without_heights
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, WEEK_NS, nearest
 from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.files.untrusted import shown
@@ -31,8 +31,6 @@ STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0
 no measurements: 0 none, 6 dead reckoning, 7 entered by hand, 8 simulated."""
 MODES = {"R": 4, "F": 5, "P": 2, "D": 2, "A": 1}
 """Quality of a mode of GNS, of which each system has one, and of RMC; the best counts. Others are no measurements."""
-FLAT_STDDEV_M = 100.0
-"""Of the height 0 m of a fix without one."""
 USED = {
     "GGA": "time lat lon quality HDOP alt sep", "GNS": "time lat lon posMode HDOP alt sep",
     "RMC": "time status lat lon spd cog date", "ZDA": "time day month year", "GST": "time stdLat stdLong stdAlt",
@@ -93,8 +91,7 @@ def read(path: Path, lines: list[str], near_ns: int | None) -> Positions:
                 (flat if sentence.msgID == "RMC" else fixes).append(one)
     skips = [Skip("fix", shown(path), f"{count} sentences: {why}", count) for why, count in lost.items()]
     if flat and not fixes:
-        told = f"{len(flat)} fixes of RMC have none: taken as 0 m; the trajectory is one of two dimensions"
-        skips.append(Skip("height", shown(path), told, len(flat)))
+        skips.append(without_heights(shown(path), len(flat)))
         fixes, deviations = flat, {}
     if not fixes:
         raise DataError(

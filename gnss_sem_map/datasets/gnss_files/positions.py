@@ -12,6 +12,8 @@ from pyproj import Transformer
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
+FLAT_STDDEV_M = 100.0
+"""Of the height 0 m of a fix without one."""
 STEP_S = 0.1
 """Of a row in so many seconds: neighbouring ones of inertial units share their errors, and are no measurements."""
 
@@ -32,6 +34,12 @@ class Positions:
     """What else it tells, (n, 3) each, by the names of `receiver_rows.with_more`; NaN where a row does not."""
     above_geoid: NDArray[np.bool_] | None = None
     """(n,) of which the height is above the geoid; of the others it is above the ellipsoid."""
+
+
+def without_heights(where: str, count: int) -> Skip:
+    """What is told of fixes that have none."""
+    told = f"{count} fixes have none: taken as 0 m; the trajectory is one of two dimensions"
+    return Skip("height", where, told, count)
 
 
 def geodetic_of_ecef(places: Array) -> Array:

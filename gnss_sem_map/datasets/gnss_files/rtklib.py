@@ -57,8 +57,7 @@ ROW = re.compile(
 
 def is_solution(lines: list[str]) -> bool:
     """Whether lines of text are of such a file: by its columns, or where it has none, by its first row."""
-    header = [line for line in lines[:100] if line.startswith("%")]
-    rows = [line for line in lines[:100] if line.strip() and not line.startswith("%")]
+    header, rows = _parts(lines[:100])
     return bool(_columns(header)) or (not header and bool(rows) and ROW.match(rows[0]) is not None)
 
 
@@ -67,8 +66,7 @@ def read(path: Path, lines: list[str]) -> Positions:
 
     Raises DataError where there is none, or a baseline without its `ref pos`.
     """
-    header = [line for line in lines if line.startswith("%")]
-    rows = [line for line in lines if line.strip() and not line.startswith("%")]
+    header, rows = _parts(lines)
     columns = _columns(header)
     form: Form = _form(columns) if columns else "deg"
     found = [row for row in (_row(line, form) for line in rows) if row is not None]
@@ -100,10 +98,21 @@ def read(path: Path, lines: list[str]) -> Positions:
     )  # fmt: skip
 
 
+def _parts(lines: list[str]) -> tuple[list[str], list[str]]:
+    """The header, whose lines begin with a percent sign or name the columns, and the rows."""
+    header = [line for line in lines if line.startswith("%") or _is_of_names(line)]
+    return header, [
+        line for line in lines if line.strip() and not (line.startswith("%") or _is_of_names(line))
+    ]
+
+
+def _is_of_names(line: str) -> bool:
+    return any(name in line for name in ("latitude(d", "x-ecef(m", "e-baseline(m")) and "Q" in line
+
+
 def _columns(header: list[str]) -> str:
     """The line that names the columns, empty where there is none."""
-    names = ("latitude(", "x-ecef(", "e-baseline(")
-    return next((line for line in header if any(name in line for name in names)), "")
+    return next(filter(_is_of_names, header), "")
 
 
 def _form(columns: str) -> Form:

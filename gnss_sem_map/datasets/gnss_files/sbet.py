@@ -27,6 +27,7 @@ from gnss_sem_map.files.untrusted import read_bytes, shown
 Array = NDArray[np.float64]
 
 COLUMNS, ACCURACY_COLUMNS = 17, 10
+MOST_TESTED = 100
 WEEK_S = 7 * 86_400.0
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FRD_OF_FLU = np.diag([1.0, -1.0, -1.0])
@@ -48,6 +49,18 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     stddevs = np.ones((len(kept), 3)) if accuracy is None else _stddevs(accuracy, seconds[kept])
     geodetic = np.column_stack([np.degrees(lat), np.degrees(lon), height])[kept]
     return Positions(stamps, geodetic, stddevs, "gps", [])
+
+
+def is_sbet(content: bytes) -> bool:
+    """Whether bytes are rows of an SBET, by their number, their times and their latitudes."""
+    if not content or len(content) % (8 * COLUMNS):
+        return False
+    rows = np.frombuffer(content, "<f8").reshape(-1, COLUMNS)[:MOST_TESTED]
+    with np.errstate(invalid="ignore"):
+        is_of_week = (rows[:, 0] > 0).all() and (rows[:, 0] < 2 * WEEK_S).all()
+        return bool(
+            is_of_week and (np.abs(rows[:, 1]) <= np.pi / 2).all() and (np.diff(rows[:, 0]) > 0).all()
+        )
 
 
 def read_poses(path: Path, near_ns: int) -> tuple[NDArray[np.int64], Array, Array]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.ros.mcap_file import McapFile
+from gnss_sem_map.datasets.ros.open_file import OpenFile
 from gnss_sem_map.datasets.ros.ros1_file import Ros1File
 from gnss_sem_map.datasets.ros.sqlite_file import SqliteFile
 from gnss_sem_map.errors import DataError, how_to_install
@@ -29,6 +30,11 @@ WHOLE_FILE = ".zstd"
 """Ending of the files of a bag that was compressed file by file."""
 NOT_CLOSED = ".active"
 """Ending of the file that a recorder of ROS 1 writes to."""
+MAGIC = {
+    ".bag": b"#ROSBAG", ".mcap": b"\x89MCAP", ".db3": b"SQLite format 3", ".zip": b"PK\3\4", ".gz": b"\x1f\x8b",
+    ".bz2": b"BZh", ".zst": b"\x28\xb5\x2f\xfd", ".7z": b"7z\xbc\xaf",
+}  # fmt: skip
+"""How files begin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +71,7 @@ class Bag:
             raise DataError(
                 f"{shown(path)}: found no {', '.join(SUFFIXES)} file, expected a bag of ROS 1 or ROS 2"
             )
-        suffixes = sorted({name.suffix for name in names})
+        suffixes = sorted({name.suffix.lower() for name in names})
         if len(suffixes) > 1:
             raise DataError(
                 f"{shown(path)}: found files of {' and '.join(suffixes)} in one folder, expected the parts of one bag"
@@ -130,7 +136,7 @@ class Bag:
 
 def bag_files(path: Path) -> list[Path]:
     """The files of a bag, sorted by name; none for what is no bag."""
-    if path.suffix in SUFFIXES and not path.is_dir():
+    if path.suffix.lower() in SUFFIXES and not path.is_dir():
         return [path] if is_file(path) else []
     if not is_folder(path):
         return []
@@ -148,14 +154,17 @@ def bag_files(path: Path) -> list[Path]:
             f"{shown(path)}: holds a part that its recorder did not close ({name}); repair it: rosbag reindex {name};"
             f" mv {name} {closed}"
         )
-    return [one for one in found if one.suffix in SUFFIXES and is_file(one)]
+    return [one for one in found if one.suffix.lower() in SUFFIXES and is_file(one)]
 
 
 def _metadata(path: Path) -> dict[str, Any]:
     """The metadata of a ROS 2 bag; empty where there are none."""
     if not path.is_dir() or not is_file(path / METADATA):
         return {}
-    about: Any = read_yaml(path / METADATA)
+    try:
+        about: Any = read_yaml(path / METADATA)
+    except DataError as error:
+        raise DataError(f"{error}; remove it: a bag that is not compressed is read without it") from None
     about = about.get("rosbag2_bagfile_information") if isinstance(about, dict) else None
     return about if isinstance(about, dict) else {}
 
@@ -177,6 +186,22 @@ def _lost(about: dict[str, Any], files: list[Path]) -> list[str]:
 
 
 def _opened(path: Path, codec: str) -> BagFile:
-    if path.suffix == ".bag":
+    ending = path.suffix.lower()
+    _refuse_others(path, ending)
+    if ending == ".bag":
         return Ros1File(path)
-    return McapFile(path, codec) if path.suffix == ".mcap" else SqliteFile(path, codec)
+    return McapFile(path, codec) if ending == ".mcap" else SqliteFile(path, codec)
+
+
+def _refuse_others(path: Path, ending: str) -> None:
+    """Raise DataError for a file that is empty, or of another kind than its ending says: no tool repairs it."""
+    head = OpenFile(path).read_up_to(0, max(map(len, MAGIC.values())))
+    if not head:
+        raise DataError(
+            f"{shown(path)}: empty (0 bytes); copy or record it again, or move it to another folder if the other parts"
+            " of the bag suffice"
+        )
+    is_of = next((name for name, magic in MAGIC.items() if head.startswith(magic)), ending)
+    if is_of != ending:
+        way = f"rename it to {shown(path.stem)}{is_of}" if is_of in SUFFIXES else "unpack it"
+        raise DataError(f"{shown(path)}: found a file of the kind {is_of}, expected {ending}; {way}")

@@ -145,7 +145,9 @@ def _to_image(info: Any) -> tuple[Array, tuple[int, int]]:
     return np.diag([1.0 / x, 1.0 / y, 1.0]) @ shift, (width // x, height // y)
 
 
-MODELS = dict.fromkeys(("plumb_bob", "rational_polynomial", "thin_prism", "radtan", "brown_conrady"), "brown")
+MODELS = dict.fromkeys(
+    ("plumb_bob", "pinhole", "rational_polynomial", "thin_prism", "radtan", "brown_conrady"), "brown"
+)
 MODELS |= dict.fromkeys(("equidistant", "fisheye", "kannala_brandt4", "kannala_brandt", "equi"), "fisheye")
 """Our names of the models of CameraInfo."""
 
@@ -155,7 +157,7 @@ def _distortion(info: Any, D: Array, topic: str | None) -> Distortion | None:
 
     A fisheye with coefficients of zero is still no pinhole.
     """
-    model = MODELS.get(str(info.distortion_model))
+    model = MODELS.get(str(info.distortion_model).strip().lower().replace(" ", "_").replace("-", "_"))
     if model != "fisheye" and not D.any():
         return None
     most = {"brown": 8, "fisheye": 4}.get(model or "", 0)

@@ -8,9 +8,10 @@
 | `timestamp`, float64 | Hesai, RoboSense: s; Livox: ns | Unix time |
 | `time_stamp`, `time_offset`, `time_offset_ns`, uint32 | Nebula, Aeva | ns after the stamp |
 
-Other fields, and their unit, may be named in rig.yaml. Else the size of the numbers tells Unix times and their unit,
-and the time from one sweep to the next the unit of others; where neither does, whole numbers are ns, others s. A cloud
-without any such field is refused, unless rig.yaml says that its points are compensated already.
+Other fields, and their unit, may be named in rig.yaml. Else the size of the numbers tells Unix times, or those of the
+clock of the stamps, and their unit, and the time from one sweep to the next the unit of others; where neither does,
+whole numbers are ns, others s. A cloud without any such field, or with the same time in all points, is refused, unless
+rig.yaml says that its points are compensated already.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from numpy.typing import NDArray
 from gnss_sem_map.datasets.frames import MOST_POINTS, refuse_other_bytes, scale_intensity
 from gnss_sem_map.datasets.point_times import are_returns, leave_out_of_sweep
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode
+from gnss_sem_map.datasets.ros.decoding import decode, header_ns
 from gnss_sem_map.datasets.ros.kinds import LIVOX
+from gnss_sem_map.datasets.stamps import LONGEST_SWEEP_S
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Points
 
@@ -36,7 +38,10 @@ Array = NDArray[np.float64]
 
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """numpy's names of PointField's datatypes."""
-TIME_FIELDS = ("time", "t", "offset_time", "timestamp", "time_stamp", "time_offset", "time_offset_ns")
+TIME_FIELDS = (
+    "time", "t", "offset_time", "timestamp", "time_stamp", "time_offset", "time_offset_ns", "timestamps", "ts", "stamp",
+    "time_us", "time_ns", "t_us", "t_ns", "timestamp_us", "timestamp_ns", "offset_ns", "dt", "point_time", "rel_time",
+)  # fmt: skip
 """Those that are known, in this order."""
 INTENSITY_FIELDS = ("intensity", "reflectivity")
 COMPENSATED = "compensated"
@@ -59,7 +64,8 @@ class PointTimes:
     field: str | None
     """None: none of them; the points are compensated."""
     unit: Unit = "s"
-    is_unix: bool = False
+    is_absolute: bool = False
+    """Of Unix time, or of the clock of the stamps."""
 
 
 def fields_of(cloud: Any) -> list[str]:
@@ -99,10 +105,20 @@ def times_of(
     field = time_field(names, said)
     if field is None:
         raise no_times(messages.topic, names)
-    told = np.array(list(_middles_and_spans(bag, messages, field))).reshape(-1, 3)
-    middle, span, is_whole = np.median(told, axis=0) if len(told) else (0.0, 0.0, 0.0)
+    told = np.array(list(_middles_and_spans(bag, messages, field))).reshape(-1, 4)
+    middle, span, is_whole, _ = np.median(told, axis=0) if len(told) else np.zeros(4)
+    if len(told) and not told[:, 1].any():
+        raise DataError(
+            f"{messages.topic}: the field {field!r} is {middle:.9g} in all points of a cloud, expected the time of each"
+            f" point; in rig.yaml, `point_times:` names another field, or is `{COMPENSATED}` if there is no motion in"
+            " the clouds any more"
+        )
     for one in UNITS if unit is None else (unit,):
-        if UNIX_S[0] < middle * UNITS[one] * 1e-9 < UNIX_S[1]:
+        after = told[:, 0] * UNITS[one] * 1e-9 - told[:, 3]
+        is_of_stamps = (
+            np.median(np.abs(after)) < LONGEST_SWEEP_S < middle * UNITS[one] * 1e-9 if len(told) else False
+        )
+        if is_of_stamps or UNIX_S[0] < middle * UNITS[one] * 1e-9 < UNIX_S[1]:
             return PointTimes(field, one, True), False
     if unit is not None:
         return PointTimes(field, unit), False
@@ -113,8 +129,13 @@ def times_of(
     return PointTimes(field, found), found != usual
 
 
-def _middles_and_spans(bag: Bag, messages: Messages, field: str) -> Iterator[tuple[float, float, bool]]:
-    """Of the times of the returns of some clouds, and whether they are whole numbers; nothing of those without any."""
+def _middles_and_spans(
+    bag: Bag, messages: Messages, field: str
+) -> Iterator[tuple[float, float, bool, float]]:
+    """Of the times of the returns of some clouds, whether they are whole numbers, and the stamp of the cloud, s.
+
+    Nothing of clouds with less than two.
+    """
     for k in messages.some(LOOKED_AT):
         try:
             table = _table(bag, messages, k, (field,))
@@ -122,8 +143,9 @@ def _middles_and_spans(bag: Bag, messages: Messages, field: str) -> Iterator[tup
             continue
         times = table[field][are_returns(_rows(table))].astype(np.float64)
         times = times[np.isfinite(times)]
-        if len(times):
-            yield float(np.median(times)), float(np.ptp(times)), table.dtype[field].kind in "iu"
+        if len(times) > 1:
+            stamp = header_ns(bag, messages, k) * 1e-9
+            yield float(np.median(times)), float(np.ptp(times)), table.dtype[field].kind in "iu", stamp
 
 
 def read_cloud(
@@ -244,9 +266,9 @@ def _largest_intensity(table: NDArray[Any]) -> float:
 def _after(times: NDArray[Any], how: PointTimes, stamp: int) -> Array:
     """The times of the points, s after the stamp, Unix ns, of their message."""
     unit = UNITS[how.unit]
-    if how.is_unix and times.dtype.kind in "iu":  # the difference of floats would be coarse
+    if how.is_absolute and times.dtype.kind in "iu":  # the difference of floats would be coarse
         return np.asarray((times.astype(np.int64) - stamp // unit) * (unit * 1e-9), np.float64)
     after = times.astype(np.float64)
-    if how.is_unix:
+    if how.is_absolute:
         after -= stamp / unit
     return np.asarray(after * (unit * 1e-9), np.float64)

@@ -13,6 +13,7 @@ from factor_graphs.csv_log import NOT_DEFINITE
 from factor_graphs.position_covariances import split_covariances
 from factor_graphs.receiver_rows import with_more
 from gnss_sem_map.datasets.gnss_files import nmea
+from gnss_sem_map.datasets.gnss_files.positions import FLAT_STDDEV_M, without_heights
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
 from gnss_sem_map.datasets.ros.kinds import SENTENCE, STRING
@@ -61,12 +62,23 @@ def fix_rows(bag: Bag, topic: str, about: GnssTopic) -> tuple[Array, Ints, list[
             " where only covariances are unknown or zero, set gnss.stddevs_m in rig.yaml"
         )
     skips += [Skip("fix", messages.topic, f"{count} messages: {why}", count) for why, count in counts.items()]
+    if np.isnan(np.array(places)[:, 2]).all():
+        skips.append(without_heights(messages.topic, len(places)))
+        places = [[lat, lon, 0.0] for lat, lon, _ in places]
+        covariances = [_flat(covariance) for covariance in covariances]
     ns = np.array(stamps, np.int64)
     stddevs, correlations, wrong = split_covariances(np.array(covariances))
     if count := int((wrong & (stddevs > 0).all(axis=1)).sum()):  # others are no fixes
         skips.append(Skip("covariance", messages.topic, f"{count} fixes: {NOT_DEFINITE}", count))
     table = np.column_stack([(ns - ns[0]) * 1e-9, np.array(places), stddevs])
     return with_more(table, correlations=correlations), ns, skips
+
+
+def _flat(covariance: Array) -> Array:
+    """Of a fix without height: what is told of east and north, and a height that nobody knows."""
+    whole = np.diag([0.0, 0.0, FLAT_STDDEV_M**2])
+    whole[:2, :2] = covariance[:2, :2]
+    return whole
 
 
 def covariance_of(fix: Any) -> tuple[str, Array | None]:

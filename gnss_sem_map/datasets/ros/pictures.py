@@ -23,11 +23,15 @@ ENCODINGS: dict[str, tuple[int, int, str]] = {
             *((f"bayer_{pattern.lower()}", 1, f"Bayer{pattern}2RGB") for pattern in ("RGGB", "BGGR", "GBRG", "GRBG")),
         )
     },
-    "8UC1": (1, 1, "GRAY2RGB"), "8UC3": (1, 3, "BGR2RGB"), "8UC4": (1, 4, "BGRA2RGB"),
+    "8uc1": (1, 1, "GRAY2RGB"), "8uc3": (1, 3, "BGR2RGB"), "8uc4": (1, 4, "BGRA2RGB"),
+    "nv12": (1, 1, "YUV2RGB_NV12"), "nv21": (1, 1, "YUV2RGB_NV21"),
     **dict.fromkeys(("yuv422", "uyvy"), (1, 2, "YUV2RGB_UYVY")),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (1, 2, "YUV2RGB_YUY2")),
 }  # fmt: skip
-"""Bytes of a number, numbers of a pixel, and OpenCV's conversion (none of RGB); of Image.encoding."""
+"""Bytes of a number, numbers of a pixel, and OpenCV's conversion (none of RGB); of Image.encoding, in small letters.
+
+Of NV12 and NV21, rows of colours stand below those of the grey picture, half as many.
+"""
 
 
 def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None) -> NDArray[np.uint8]:
@@ -35,12 +39,12 @@ def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | Non
     message, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
     if why := unread_encoding(message):
         raise DataError(
-            f"{where}: found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; convert the images"
-            " when they are recorded"
+            f"{where}: found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; record them so, or"
+            " convert them once (image_transport republish)"
         )
     if messages.kind == COMPRESSED_IMAGE:
         picture = decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)
-        recorded = message.format.partition(";")[0].strip()
+        recorded = message.format.partition(";")[0].strip().lower()
         if recorded.startswith("bayer") and recorded in ENCODINGS and (picture == picture[..., :1]).all():
             return _as_rgb(
                 np.ascontiguousarray(picture[..., :1]), ENCODINGS[recorded][2], where
@@ -52,7 +56,7 @@ def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | Non
 def unread_encoding(message: Any) -> str:
     """The encoding of an image that is not read; empty where it is."""
     if hasattr(message, "encoding"):
-        return "" if message.encoding in ENCODINGS else str(message.encoding)[:40]
+        return "" if message.encoding.lower() in ENCODINGS else str(message.encoding)[:40] or "none"
     said = str(message.format).lower()
     is_said = any(name in said for name in ("png", "jpeg", "jpg")) and "compresseddepth" not in said
     is_seen = bytes(np.asarray(message.data[: len(PNG)], np.uint8)).startswith((PNG, JPEG))
@@ -66,7 +70,8 @@ def _raw(message: Any, where: str, size: tuple[int, int] | None) -> NDArray[np.u
             f"{where}: found {width} x {height} pixels, expected {size[0]} x {size[1]} as in the calibration",
             (width, height),
         )
-    of_number, depth, code = ENCODINGS[message.encoding]
+    of_number, depth, code = ENCODINGS[message.encoding.lower()]
+    height += height // 2 if "NV" in code else 0
     row, data = width * depth * of_number, np.asarray(message.data, np.uint8)
     if not 0 < width * height <= MOST_PIXELS or step < row or data.size < step * height:
         raise DataError(

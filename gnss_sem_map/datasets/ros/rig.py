@@ -162,6 +162,9 @@ def rig_file(bag: Path) -> Path | None:
     """The rig.yaml of a bag: in its folder, else beside it, or beside the target of a link; None if there is none."""
     places = [bag / NAME] if bag.is_dir() else []
     places += [bag.absolute().parent / NAME, bag.resolve().parent / NAME]
+    others = [place.with_suffix(".yml") for place in places if is_file(place.with_suffix(".yml"))]
+    if others and not any(map(is_file, places)):
+        raise DataError(f"{shown(others[0])}: is not read; rename it to {NAME}")
     return next((place for place in places if is_file(place)), None)
 
 

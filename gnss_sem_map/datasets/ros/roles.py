@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from gnss_sem_map.datasets.ros.bag import Bag
+from gnss_sem_map.datasets.ros.decoding import decode
 from gnss_sem_map.datasets.ros.imu_topics import part_of
 from gnss_sem_map.datasets.ros.kinds import INFO, KINDS, NAMED, unread
+from gnss_sem_map.datasets.ros.pictures import unread_encoding
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, ImuTopic, LidarTopic, Rig
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
@@ -31,7 +33,8 @@ def completed(bag: Bag, rig: Rig) -> Rig:
         topic = _only(bag, "LiDAR", "lidars: {NAME: {topic: ...}}")
         update["lidars"] = {} if topic is None else {"lidar": LidarTopic(topic=topic)}
     if "cameras" not in rig.model_fields_set:
-        topic = _only(bag, "camera", "cameras: {NAME: {topic: ...}}")
+        readable = [topic for topic in of_kind(bag, "camera") if not unread_images(bag, topic)]
+        topic = _only(bag, "camera", "cameras: {NAME: {topic: ...}}", readable)
         update["cameras"] = (
             {} if topic is None else {"camera": CameraTopic(topic=topic, info=info_beside(bag, topic))}
         )
@@ -53,6 +56,14 @@ def of_kind(bag: Bag, sensor: str) -> list[str]:
     ]
 
 
+def unread_images(bag: Bag, topic: str) -> str:
+    """The encoding of the images of a topic, where it is not read, by the first; empty where it is."""
+    try:
+        return unread_encoding(decode(bag, bag.messages(topic), 0))
+    except (DataError, IndexError):
+        return ""  # told where they are read
+
+
 def info_beside(bag: Bag, topic: str) -> str | None:
     """The CameraInfo of an image topic: the one in the nearest namespace, or the only one; None if there is none."""
     infos = sorted(name for name, kind in bag.kinds.items() if kind == INFO)
@@ -69,6 +80,12 @@ def missing(bag: Bag, rig: Rig) -> list[Skip]:
     """That there is no IMU, no receiver or, where packets of one are there, no LiDAR."""
     notes = [] if rig.lidars else [(topic, note) for topic, note in _notes(bag) if "LiDAR" in note]
     skips = [Skip("scan", topic, note) for topic, note in notes]
+    if not rig.cameras:
+        skips += [
+            Skip("image", topic, f"not read: its images have the encoding {encoding}")
+            for topic in of_kind(bag, "camera")
+            if (encoding := unread_images(bag, topic))
+        ]
     if rig.imu is not None and rig.gnss is not None:
         return skips
     what = "an IMU (sensor_msgs/Imu)" if rig.imu is None else "a receiver (sensor_msgs/NavSatFix)"

@@ -31,15 +31,15 @@ Edges = dict[str, tuple[str, Array]]
 LOOKED_AT = 500
 """Messages of a topic of changing transforms that tell which of them stay the same."""
 MOST_XML_BYTES = 2 << 20
-MOST_OFF_UNIT = 1e-3
-"""A quaternion is normalised; one whose length is farther from 1 is none."""
+MOST_OFF_UNIT = 0.02
+"""A quaternion is normalised, as it may be written with two digits; one whose length is farther from 1 is none."""
 
 
 class StaticTransforms:
     """Poses of frames in their parents: `T_parent_child`, by child; `more` count only where `edges` join no frames."""
 
-    def __init__(self, edges: Edges, more: Edges | None = None) -> None:
-        self._edges, self._all = edges, (more or {}) | edges
+    def __init__(self, edges: Edges, more: Edges | None = None, wrong: dict[str, str] | None = None) -> None:
+        self._edges, self._all, self._wrong = edges, (more or {}) | edges, wrong or {}
 
     @property
     def frames(self) -> list[str]:
@@ -49,7 +49,12 @@ class StaticTransforms:
     def between(self, target: str, source: str) -> Array | None:
         """T_target_source (4, 4), None where no chain of transforms joins them; raises DataError for a circle."""
         found = _between(self._edges, target, source)
-        return _between(self._all, target, source) if found is None else found
+        found = _between(self._all, target, source) if found is None else found
+        if found is None and self._wrong:
+            raise DataError(
+                f"{'; '.join(self._wrong.values())[:400]}; give the poses (T_imu_lidar, T_camera_lidar) in rig.yaml"
+            )
+        return found
 
 
 def _between(edges: Edges, target: str, source: str) -> Array | None:
@@ -81,8 +86,8 @@ def _ancestors(edges: Edges, frame: str) -> dict[str, Array]:
 
 
 def read_static_transforms(bag: Bag) -> StaticTransforms:
-    """The fixed transforms of a bag; none where it has none. Raises DataError for a static one that is no pose."""
-    static, more = Edges(), Edges()
+    """The fixed transforms of a bag; none where it has none. A static one that is no pose is told where it lacks."""
+    static, more, wrong = Edges(), Edges(), dict[str, str]()
     for name, kinds, read in (
         ("tf", TRANSFORMS, _that_stay),
         (URDF, (STRING,), _of_robots),
@@ -97,12 +102,12 @@ def read_static_transforms(bag: Bag) -> StaticTransforms:
                 T = _pose(numbers)
                 if T is not None:
                     (static if name == STATIC else more)[child] = (parent, T)
-                elif name == STATIC:  # others may have frames that nobody needs
-                    raise DataError(
+                elif name == STATIC:
+                    wrong[child] = (
                         f"{topic}: {parent} to {child}: found {list(numbers)}, expected metres x y z and a unit"
                         " quaternion x y z w"
                     )
-    return StaticTransforms(static, more)
+    return StaticTransforms(static, more, wrong)
 
 
 def _transforms(messages: Iterable[Any]) -> Iterator[Told]:

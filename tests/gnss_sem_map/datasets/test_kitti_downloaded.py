@@ -130,6 +130,40 @@ def test_a_folder_of_a_camera_without_images_does_not_hide_another_one(copy: Pat
     assert open_drive(copy).images
 
 
+@pytest.mark.parametrize("place", [".", "../..", "../2011_09_26_calib/2011_09_26"])
+def test_the_calibration_may_be_unpacked_elsewhere(small_drive: Street, copy: Path, place: str) -> None:
+    (copy / place).mkdir(parents=True, exist_ok=True)
+    for file in copy.parent.glob("calib*.txt"):
+        file.rename(copy / place / file.name)
+    found, plain = open_drive(copy).calibration, open_drive(small_drive.drive).calibration
+    np.testing.assert_array_equal(found.T_imu_lidar, plain.T_imu_lidar)
+    np.testing.assert_array_equal(found.cameras[0].K, plain.cameras[0].K)
+
+
+@pytest.mark.parametrize("name", ["image_02/timestamps.txt", "velodyne_points/timestamps_end.txt"])
+def test_stamps_that_others_tell_may_lack(small_drive: Street, copy: Path, name: str) -> None:
+    (copy / name).unlink()
+    found, plain = open_drive(copy), open_drive(small_drive.drive)
+    assert [skip.what for skip in found.skips] == ["stamps"]
+    for ours, theirs in ((found.images, plain.images), (found.scans, plain.scans)):
+        np.testing.assert_allclose([one.stamp for one in ours], [one.stamp for one in theirs], atol=0.05)
+    stamps, others = found.scans[1].read().stamps, plain.scans[1].read().stamps
+    assert stamps is not None
+    assert others is not None
+    np.testing.assert_allclose(stamps, others, atol=2e-3)
+
+
+@pytest.mark.parametrize("folder", ["velodyne_points", "oxts"])
+def test_what_is_still_packed_is_named(copy: Path, folder: str) -> None:
+    shutil.make_archive(str(copy / folder), "zip", copy / folder)
+    shutil.rmtree(copy / folder)
+    if folder == "oxts":
+        with pytest.raises(DataError, match=r"unpack oxts\.zip"):
+            open_drive(copy)
+    else:
+        assert any("unpack velodyne_points.zip" in skip.reason for skip in open_drive(copy).skips)
+
+
 @pytest.mark.parametrize("camera", [3, 0])
 def test_a_sequence_as_downloaded(small_drive: Street, tmp_path: Path, camera: int) -> None:
     sequence = street.write_odometry(tmp_path, small_drive)

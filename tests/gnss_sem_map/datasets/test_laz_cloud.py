@@ -58,6 +58,14 @@ def test_points_are_where_they_are_on_earth_in_any_coordinate_system(tmp_path: P
     assert np.abs(base.points[order] - metres[np.lexsort(metres.T[::-1])]).max() < 0.02
 
 
+@pytest.mark.parametrize("epsg", [31467, 2056])
+def test_heights_beside_two_axes_are_not_those_above_their_ellipsoid(tmp_path: Path, epsg: int) -> None:
+    """Of Bessel, in Germany and Switzerland: its ellipsoid lies some 50 m off that of WGS 84."""
+    metres = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 1.0], [7.0, -20.0, 2.0]])
+    base = read_base(write(tmp_path / "base.laz", around(metres), epsg), FRAME)
+    np.testing.assert_allclose(np.sort(base.points[:, 2]), [0, 1, 2], atol=0.01)
+
+
 def test_cubes_become_their_mean_and_withheld_points_are_left_out(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     metres = np.concatenate([rng.uniform(0.05, 0.35, (1000, 3)), rng.uniform(10.05, 10.35, (50, 3))])
@@ -81,8 +89,10 @@ def test_a_cloud_is_seen_from_a_pose_in_its_axes(tmp_path: Path) -> None:
 
 def test_what_is_no_base_is_refused_by_name(tmp_path: Path) -> None:
     metres = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    with pytest.raises(DataError, match=r"^\S*local\.laz: has no coordinate system; .* LAS or LAZ$"):
+    with pytest.raises(DataError, match=r"^\S*local\.laz: has no coordinate system; .*pdal translate .*EPSG"):
         read_base(write(tmp_path / "local.laz", around(metres), epsg=None), FRAME)
+    with pytest.raises(DataError, match="holds no points"):
+        read_base(write(tmp_path / "empty.laz", around(metres[:1]), withheld=1), FRAME)
     with pytest.raises(DataError, match="found no point within 100 km"):
         read_base(write(tmp_path / "far.laz", around(metres)), LocalFrame(52.5, 13.4, 34.0))
     text = tmp_path / "text.laz"

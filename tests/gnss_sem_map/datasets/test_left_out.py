@@ -149,6 +149,16 @@ def test_rows_of_the_imu_that_fill_a_gap_are_left_out_and_counted(copy: Path) ->
     assert left_out(log) == [("oxts", 5, "5 rows on straight lines that fill gaps")]
 
 
+@pytest.mark.parametrize("ending", [".pcd", ".ply"])
+def test_scans_in_another_format_are_named_with_how_to_write_ours(
+    small_drive: Street, tmp_path: Path, ending: str
+) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    for path in drive.glob("lidar/*.bin"):
+        path.rename(path.with_suffix(ending))
+    assert any(ending in skip.reason and "tofile" in skip.reason for skip in open_drive(drive).skips)
+
+
 def test_frames_that_are_named_otherwise_are_counted_and_named(small_drive: Street, tmp_path: Path) -> None:
     """A log without a scan says why; images that are not found make no map without classes in silence."""
     drive = street.write_table_log(tmp_path, small_drive)

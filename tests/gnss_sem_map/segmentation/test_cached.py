@@ -188,8 +188,8 @@ GOOD = some_probabilities() / np.float32(255)
         (lambda folder: (folder / "0.npz").write_bytes(b"PK\x03\x04 nonsense"), "damaged"),
         (lambda folder: (folder / "0.png").write_bytes(b"\x89PNG\r\n"), "damaged"),
         (
-            lambda folder: write_png(folder / "0.png", np.full((9, 13, 3), 7, np.uint8)),
-            "found .'#070707'., which are no colour",
+            lambda folder: write_png(folder / "0.png", np.full((9, 13, 3), (9, 8, 7), np.uint8)),
+            "found .'#070809'., which are no colour",
         ),
         (lambda folder: write_png(folder / "0.png", np.zeros((9, 13, 3), np.uint16)), "uint16"),
         (lambda folder: write_png(folder / "0.png", np.zeros((8, 13), np.uint8)), "13 x 8 pixels"),

@@ -36,6 +36,10 @@ def rgb(source: str, names: dict[str, str] | None = None) -> np.ndarray:
     return np.dstack([packed >> 16, packed >> 8 & 255, packed & 255]).astype(np.uint8)
 
 
+def grey_as_colours(values: np.ndarray) -> np.ndarray:
+    return np.repeat(values[..., None].astype(np.uint8), 3, axis=2)
+
+
 def save(path: Path, pixels: np.ndarray, palette: list[int] | None = None, **how: Any) -> None:
     picture = Picture.fromarray(pixels)
     if palette is not None:
@@ -104,6 +108,14 @@ WRITERS = {
     ),
     "Cityscapes colours by a palette of few bits": lambda f: (
         Picture.fromarray(rgb("cityscapes")).quantize(6).save(f / "3.png", bits=4)
+    ),
+    "trainIds in three equal channels": lambda f: save(f / "3.png", grey_as_colours(ids("train_id"))),
+    "labelIds in three equal channels, with alpha": lambda f: save(
+        f / "3.png", np.dstack([grey_as_colours(ids("label_id")), np.full((24, 40), 255, np.uint8)])
+    ),
+    "trainIds with void 19": lambda f: (
+        save(f / "2.png", np.full((24, 40), 19, np.uint8)),
+        save(f / "3.png", ids("train_id").astype(np.uint8)),
     ),
     "grey of 4 bits": lambda f: four_bits(f / "3.png", ids("train_id")),
 }
@@ -192,6 +204,36 @@ def test_ids_that_fit_both_are_asked_about(tmp_path: Path, others: tuple[int, in
     assert str(tmp_path) in str(e.value)
     for kind, name in (("train_id", "vegetation"), ("label_id", "sidewalk")):
         assert (classes_seen(tmp_path, more=f"?ids={kind}")[12:] == NAMES.index(name)).all()
+
+
+STREET = np.repeat([["sky"], ["building"], ["vegetation"], ["road"]], 6, axis=0).repeat(40, axis=1)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.vectorize(lambda name: taxonomy("camvid").ids["id"][CAMVID.get(name, name)])(STREET),
+        np.where(STREET == "road", 1, 0),
+        np.where(STREET == "road", 0, 2) + np.where(STREET == "road", 3, 0),
+    ],
+)
+def test_ids_with_which_roads_are_above_or_nowhere_are_asked_about(
+    tmp_path: Path, values: np.ndarray
+) -> None:
+    """CamVid's, whose 0 is the sky; a mask of roads; fences in place of roads."""
+    save(tmp_path / "3.png", values.astype(np.uint8))
+    with pytest.raises(
+        ConfigError, match=r"train_id of cityscapes, but then .*road.*\?taxonomy=.*\?ids=train_id"
+    ):
+        classes_seen(tmp_path)
+    assert classes_seen(tmp_path, more="?ids=train_id").shape == (24, 40)
+
+
+def test_a_time_as_a_name_is_no_frame_number(tmp_path: Path) -> None:
+    for k in range(3):
+        save(tmp_path / f"{1_780_000_000 + k / 10:.6f}.png", ids("train_id").astype(np.uint8))
+    with pytest.raises(DataError, match=r"named by a time.*number of the frame"):
+        classes_seen(tmp_path)
 
 
 def test_names_of_files_decide_before_ids(tmp_path: Path) -> None:

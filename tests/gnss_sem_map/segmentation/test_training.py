@@ -269,7 +269,7 @@ def broken(folder: Path, what: str) -> LabelledFolder:
         case "no labels":
             (labels / "000001.png").unlink()
         case "colours":
-            cv2.imwrite(str(labels / "000000.png"), np.zeros((48, 96, 3), np.uint8))
+            cv2.imwrite(str(labels / "000000.png"), np.full((48, 96, 3), (0, 9, 0), np.uint8))
         case "size":
             cv2.imwrite(str(labels / "000000.png"), np.zeros((48, 95), np.uint8))
         case "ids":

@@ -96,9 +96,7 @@ def test_a_gnss_csv_without_deviations_names_the_setting_with_which_it_is_read(t
     (tmp_path / "gnss.csv").write_text("Time;Latitude;Longitude;H-MSL\n" + fixes)
     about: dict[str, object] = {"epoch_ns": START_NS}
     (tmp_path / "log.yaml").write_text(json.dumps(about))
-    with pytest.raises(
-        DataError, match=r"column alt_m is missing.*`gnss_file: \{path: gnss\.csv\}` in log\.yaml"
-    ):
+    with pytest.raises(DataError, match=r"stddevs_m.*`gnss_file: \{path: gnss\.csv\}` in log\.yaml"):
         open_drive(tmp_path)
     about["gnss_file"] = {"path": "gnss.csv", "stddevs_m": [2, 2, 4], "geoid": 48.5}
     (tmp_path / "log.yaml").write_text(json.dumps(about))

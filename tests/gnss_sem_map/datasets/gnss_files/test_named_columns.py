@@ -127,6 +127,25 @@ FILES: dict[str, str] = {
             f"{abs(v):.9f}{'NS'[int(v < 0)] if i == 0 else 'EW'[int(v < 0)]}" for i, v in enumerate(PLACES[k, :2])
         ), PLACES[k, 2], *STDDEVS],
     ),
+    "a CSV with hemispheres in columns of their own": table(
+        "time,lat,N/S,lon,E/W,height,std_e,std_n,std_u",
+        lambda k: [NS[k] / 1e9, abs(PLACES[k, 0]), "NS"[int(PLACES[k, 0] < 0)], abs(PLACES[k, 1]), "W", PLACES[k, 2],
+                   *STDDEVS],
+    ),
+    "BESTPOSA of NovAtel": "[COM1]\n" + "".join(
+        f"#BESTPOSA,COM1,0,90.5,FINESTEERING,{WEEK},{SOW[k]:.3f},02000040,cdba,32768;SOL_COMPUTED,NARROW_INT,"
+        f"{PLACES[k, 0]:.11f},{PLACES[k, 1]:.11f},{PLACES[k, 2] - 48:.4f},48.0,WGS84,{STDDEVS[1]},{STDDEVS[0]},"
+        f'{STDDEVS[2]},"0",1.0,0.0,12,12,12,12,0,06,00,00*1a2b3c4d\n' for k in range(3)
+    ) + "#BESTPOSA,COM1,0,90.5,FINESTEERING,1,1.0,0,0,1;INSUFFICIENT_OBS,NONE,0,0,0,0,WGS84,0,0,0*0\n",
+    "INSPVAXA of NovAtel": "".join(
+        f"#INSPVAXA,COM1,0,90.5,FINESTEERING,{WEEK},{SOW[k]:.3f},02000040,cdba,32768;INS_SOLUTION_GOOD,INS_PSRSP,"
+        f"{PLACES[k, 0]:.11f},{PLACES[k, 1]:.11f},{PLACES[k, 2] - 48:.4f},48.0,1,0,0,0.1,0.2,90,{STDDEVS[1]},"
+        f"{STDDEVS[0]},{STDDEVS[2]},0.1,0.1,0.1,0.1,0.1,0.1,3,0*1a2b3c4d\n" for k in range(3)
+    ),
+    "u-center": table(
+        "UTC,Lat,Lon,Alt (MSL),Alt (HAE),sd_east,sd_north,vAcc",
+        lambda k: [f"{moment(NS[k]):%Y-%m-%d %H:%M:%S.000}", *PLACES[k, :2], 112.1, PLACES[k, 2], *STDDEVS],
+    ),
     "a CSV of geocentric positions": table(
         "week,tow,X-ECEF,Y-ECEF,Z-ECEF,std_e,std_n,std_u",
         lambda k: [WEEK, SOW[k], *Transformer.from_crs(4979, 4978, always_xy=True).transform(
@@ -162,6 +181,49 @@ def test_a_table_without_deviations_or_above_a_geoid_says_the_setting(tmp_path: 
         read(path, stddevs_m=(0.1, 0.1, 0.2))
     found = read(path, stddevs_m=(0.1, 0.1, 0.2), geoid=48.5)
     np.testing.assert_allclose(found.rows[:, 3], PLACES[:, 2] + 48.5)
+
+
+@pytest.mark.parametrize(
+    "inner", ["<ele>{:.4f}</ele><time>{}</time>", "<time>{1}</time>\n<ele>{0:.4f}</ele>"]
+)
+def test_tracks_of_gpx_need_what_they_do_not_tell(tmp_path: Path, inner: str) -> None:
+    path = tmp_path / "track.gpx"
+    points = "".join(
+        f'<trkpt lat="{p[0]}" lon="{p[1]}">{inner.format(p[2] - 48.5, f"{moment(ns):%Y-%m-%dT%H:%M:%SZ}")}</trkpt>\n'
+        for ns, p in zip(NS, PLACES, strict=True)
+    )
+    path.write_text(f'<?xml version="1.0"?>\n<gpx version="1.1"><trk><trkseg>{points}</trkseg></trk></gpx>')
+    with pytest.raises(DataError, match="stddevs_m"):
+        read(path)
+    found = read(path, stddevs_m=(1, 1, 2), geoid=48.5)
+    np.testing.assert_allclose(found.rows[:, :4], np.column_stack([[0, 1, 2], PLACES]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"     3.04           OBSERVATION DATA    M (MIXED)           RINEX VERSION / TYPE\n", "rnx2rtkp"),
+        (b"\xb5\x62\x02\x15\x10\x00" + bytes(40), "rnx2rtkp"),
+        (b"\xd3\x00\x13" + bytes(40), "rnx2rtkp"),
+        (b"PK\3\4" + bytes(40), "unpack it"),
+        (b"$PUBX,00,202640.00,4900.06,N,00824.0,E,160.1,G3*6F\n", "write GGA"),
+    ],
+)
+def test_what_holds_no_positions_is_named_with_the_way_to_them(
+    tmp_path: Path, content: bytes, said: str
+) -> None:
+    path = tmp_path / "rover.bin"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=said):
+        read(path)
+
+
+def test_without_heights_the_trajectory_is_flat_and_that_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "export.csv"
+    path.write_text(table("time,lat,lon,hAcc", lambda k: [NS[k] / 1e9, *PLACES[k, :2], 0.5]))
+    found = read(path)
+    np.testing.assert_array_equal(found.rows[:, 3:7], np.tile([0, 0.5, 0.5, 100.0], (3, 1)))
+    assert [skip.what for skip in found.skips] == ["height"]
 
 
 def test_many_rows_are_thinned_and_those_without_a_place_counted(tmp_path: Path) -> None:

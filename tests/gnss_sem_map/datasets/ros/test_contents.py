@@ -40,7 +40,7 @@ def test_topics_have_rates_gaps_and_a_sensor(tmp_path: Path) -> None:
 def test_what_would_stop_a_run_is_noted(tmp_path: Path) -> None:
     rig = ros.drive(frames=False)
     rig.messages = [one for one in rig.messages if one[0] == "/imu"]
-    rig.cloud(START_NS, sweep(np.zeros(4), name="ring"))
+    rig.cloud(START_NS, sweep(np.linspace(0, 0.1, 4), name="ring"))
     rig.fix(START_NS, kind=0)
     rig.image(START_NS, np.zeros((4, 6), np.uint8), "32FC1")
     for k in range(5):
@@ -90,7 +90,7 @@ def test_the_suggested_rig_reads_the_bag(tmp_path: Path) -> None:
 
 def test_the_suggested_rig_has_all_that_may_be_a_sensor(tmp_path: Path) -> None:
     rig = ros.drive()
-    rig.cloud(START_NS, sweep(np.zeros(4)), topic="/rear/points")
+    rig.cloud(START_NS, sweep(np.linspace(0, 0.1, 4)), topic="/rear/points")
     path = ros.write(tmp_path / "drive", rig)
     bag = Bag(path)
     text = suggested_rig(bag, contents_of(bag))

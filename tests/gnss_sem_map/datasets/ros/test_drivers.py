@@ -79,6 +79,37 @@ def test_the_unit_of_unix_times_is_that_of_this_century(tmp_path: Path, unit: st
     check_times(opened(tmp_path, rig))
 
 
+@pytest.mark.parametrize("name", ["timestamp", "ts"])
+def test_times_on_the_clock_of_the_stamps_are_absolute(tmp_path: Path, name: str) -> None:
+    """As of a computer's uptime, or of simulated time."""
+    rig = without_clouds()
+    for k in range(10):
+        uptime_ns = 5_000_000_000 + k * STEP_NS
+        rig.cloud(START_NS + k * STEP_NS, sweep(uptime_ns * 1e-9 + TIMES, "<f8", name), header_ns=uptime_ns)
+    check_times(opened(tmp_path, rig))
+
+
+@pytest.mark.parametrize("value", [0.0, START_NS * 1e-9])
+def test_one_time_for_all_points_is_none(tmp_path: Path, value: float) -> None:
+    """Zero of drivers without times; Unix time as float32."""
+    rig = without_clouds()
+    for k in range(10):
+        rig.cloud(START_NS + k * STEP_NS, sweep(np.full(64, value)))
+    with pytest.raises(DataError, match=r"'time' is .* in all points .*`point_times:` .*`compensated`"):
+        opened(tmp_path, rig)
+    rig_yaml(tmp_path / "drive", lidars={"lidar": {"topic": "/points", "point_times": "compensated"}})
+    assert open_drive(tmp_path / "drive").scans[0].read().stamps is None
+
+
+def test_an_intensity_that_is_no_number_is_zero(tmp_path: Path) -> None:
+    rig, table = without_clouds(), sweep(TIMES)
+    table["intensity"][::2] = np.nan
+    for k in range(10):
+        rig.cloud(START_NS + k * STEP_NS, table)
+    intensity = opened(tmp_path, rig).scans[0].read().intensity
+    np.testing.assert_array_equal(intensity, np.nan_to_num(table["intensity"]))
+
+
 @pytest.mark.parametrize("unit", ["us", "ms"])
 def test_the_unit_is_a_setting(tmp_path: Path, unit: str) -> None:
     """Of sweeps of 5 ms, 100 ms apart, the numbers alone do not tell it."""

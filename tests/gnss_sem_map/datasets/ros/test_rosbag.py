@@ -141,7 +141,7 @@ def test_rows_without_a_return_have_any_time(
 def test_intensities_have_the_scale_that_the_rig_says(tmp_path: Path, kind: str) -> None:
     fields = [(name, "<f4") for name in "xyz"]
     table = np.ones(5, [*fields, ("intensity", kind), ("time", "<f4")])
-    table["intensity"], table["time"] = [0, 1, 17, 100, 200], 0.0
+    table["intensity"], table["time"] = [0, 1, 17, 100, 200], np.linspace(0, 0.1, 5)
     rig = ros.drive()
     rig.messages = [one for one in rig.messages if one[0] != "/points"]
     rig.cloud(START_NS, table)

@@ -14,6 +14,7 @@ import pytest
 import ros
 from commands import gnss_sem_map
 from ros import START_NS, rig_yaml, sweep, with_camera
+from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.ros.bag import Bag
@@ -297,10 +298,15 @@ def test_images_of_an_unknown_lens_are_refused(tmp_path: Path) -> None:
 def test_an_encoding_that_is_not_known_is_named(tmp_path: Path) -> None:
     rig = with_camera()
     rig.image(START_NS, np.zeros((4, 6), np.uint8), "32FC1")
+    rig.image(START_NS + 1, np.zeros((4, 6), np.uint8), "")
+    bag = ros.write(tmp_path / "drive", rig)
+    rig_yaml(bag, cameras={"front": {"topic": "/image_rect", "info": "/camera_info"}})
+    with pytest.raises(DataError, match="found encoding 'none'"):
+        open_drive(bag).images[1].read()
     with pytest.raises(
         DataError, match=r"found encoding '32FC1', expected PNG, JPEG, or one of rgb8, bgr8, .*convert"
     ):
-        open_drive(ros.write(tmp_path / "drive", rig)).images[0].read()
+        open_drive(bag).images[0].read()
 
 
 def test_missing_and_circular_transforms(tmp_path: Path) -> None:
@@ -314,6 +320,93 @@ def test_missing_and_circular_transforms(tmp_path: Path) -> None:
     rig.transforms(("imu", "base", (0, 0, 0)), ("base", "lidar", (0, 0, 0)), ("lidar", "imu", (0, 0, 0)))
     with pytest.raises(DataError, match=r"a circle of frames, .*; expected a tree"):
         open_drive(ros.write(tmp_path / "circle", rig))
+
+
+def turned(child: str, quaternion: tuple[float, float, float, float]) -> ros.Rig:
+    """A drive whose static transform of one frame has a quaternion x y z w."""
+    rig = ros.drive()
+    for message in (message for topic, _, message in rig.messages if topic == "/tf_static"):
+        for one in message.transforms:
+            if one.child_frame_id == child:
+                q = one.transform.rotation
+                q.x, q.y, q.z, q.w = quaternion
+    return rig
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.71, 0.71), (0.7, 0.0, 0.0, 0.7)])
+def test_quaternions_of_two_digits_are_normalised(
+    tmp_path: Path, quaternion: tuple[float, float, float, float]
+) -> None:
+    T = open_drive(ros.write(tmp_path / "drive", turned("lidar", quaternion))).calibration.T_imu_lidar
+    np.testing.assert_allclose(T[:3, :3], Rotation.from_quat(quaternion).as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.5)])
+def test_a_quaternion_that_is_none_stops_those_who_need_it_alone(
+    tmp_path: Path, quaternion: tuple[float, float, float, float]
+) -> None:
+    bag = ros.write(tmp_path / "drive", turned("lidar", quaternion))
+    with pytest.raises(DataError, match=r"/tf_static: base to lidar: found .*unit quaternion.*T_imu_lidar"):
+        open_drive(bag)
+    rig_yaml(bag, lidars={"lidar": {"topic": "/points", "T_imu_lidar": np.eye(4).tolist()}})
+    assert open_drive(bag).scans
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", r"empty \(0 bytes\); copy or record it again"),
+        (b"PK\3\4" + bytes(99), "of the kind .zip.*unpack it"),
+        (b"\x89MCAP0\r\n" + bytes(99), r"rename it to drive\.mcap"),
+    ],
+)
+def test_a_file_of_another_kind_is_not_called_damaged(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "drive.bag").write_bytes(content)
+    with pytest.raises(DataError, match=said):
+        open_drive(tmp_path / "drive.bag")
+
+
+@pytest.mark.parametrize("is_ros1", [True, False])
+def test_endings_may_have_capital_letters(tmp_path: Path, is_ros1: bool) -> None:
+    bag = tmp_path / ("drive.BAG" if is_ros1 else "drive.MCAP")
+    if is_ros1:
+        ros.write(tmp_path / "drive.bag", ros.drive(is_ros1), "bag").rename(bag)
+    else:
+        ros.write_mcap(bag, ros.drive(), "ros2")
+    assert len(open_drive(bag).scans) == 10
+
+
+def test_files_beside_a_bag_that_cannot_be_read_are_named_with_what_to_do(tmp_path: Path) -> None:
+    bag = ros.write(tmp_path / "drive", ros.drive())
+    (bag / "rig.yml").write_text("gnss: {topic: /other}\n")
+    with pytest.raises(DataError, match=r"rig\.yml: .*rename it to rig\.yaml"):
+        open_drive(bag)
+    (bag / "rig.yml").unlink()
+    (bag / "metadata.yaml").write_text("files: [a\n")
+    with pytest.raises(DataError, match=r"metadata\.yaml: .*remove it"):
+        open_drive(bag)
+
+
+def test_fixes_without_heights_make_a_flat_trajectory_and_that_is_said(tmp_path: Path) -> None:
+    rig = ros.drive()
+    for message in (message for topic, _, message in rig.messages if topic == "/fix"):
+        message.altitude = float("nan")
+    log = open_drive(ros.write(tmp_path / "drive", rig))
+    assert log.gnss is not None
+    np.testing.assert_allclose(log.gnss.stddevs, np.tile([0.5, 0.5, 100.0], (5, 1)))
+    assert [skip.what for skip in log.skips] == ["height"]
+
+
+@pytest.mark.parametrize("model", ["Plumb Bob", "pinhole"])
+def test_models_of_lenses_as_drivers_spell_them(tmp_path: Path, model: str) -> None:
+    rig = with_camera(model=model, d=(0.1, 0.01, 0.001, 0.002, 0.0))
+    rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8", topic="/image_raw")
+    bag = ros.write(tmp_path / "drive", rig)
+    rig_yaml(bag, cameras={"front": {"topic": "/image_raw", "info": "/camera_info"}})
+    lens = open_drive(bag).calibration.cameras[0].distortion
+    assert lens is not None
+    assert lens.model == "brown"
+    np.testing.assert_array_equal(lens.coefficients[:4], (0.1, 0.01, 0.001, 0.002))
 
 
 def test_covariances_of_fixes_are_used_and_what_is_none_is_counted(tmp_path: Path) -> None:

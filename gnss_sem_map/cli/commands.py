@@ -34,7 +34,6 @@ COMMANDS = (
     mapping.run,
     mapping.add,
     mapping.remove,
-    mapping.merge,
     mapping.trajectory,
     finished.refine,
     finished.relabel,

@@ -120,22 +120,6 @@ def print_many(about: dict[str, Any], out: Path, as_json: bool) -> None:
     warn(f"{name} is left out: {reason}" for name, reason in about["failed"].items())
 
 
-def print_merged(about: dict[str, Any], out: Path) -> None:
-    """Size of the merged map and alignment of the second run to the first; a failed registration on stderr."""
-    match, (first, second) = about["match"], about["merged"]
-    before, after = (_percent(match["overlap"][moment]) for moment in ("by_georeference", "aligned"))
-    typer.echo(f"{about['name']}: {about['map']['voxels']} voxels")
-    if match["shift_m"] is not None:
-        typer.echo(
-            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {after} % of its voxels"
-            f" overlap {first}, by georeference {before} %"
-        )
-    else:
-        typer.echo(f"{second} is aligned by its georeference alone: {after} % of its voxels overlap {first}")
-        warn([f"{second} could not be registered to {first}: {match['reason']}"] if match["reason"] else [])
-    typer.echo(f"results in {out}")
-
-
 def print_metrics(metrics: dict[str, Any]) -> None:
     """Accuracy and IoU per class of what a camera saw, before and after refinement, then the single figures."""
     from rich.console import Console

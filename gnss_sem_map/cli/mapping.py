@@ -1,4 +1,4 @@
-"""Commands that make a map or a trajectory: `run`, `add`, `remove`, `merge`, `trajectory`."""
+"""Commands that make a map or a trajectory: `run`, `add`, `remove`, `trajectory`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import typer
 
 from gnss_sem_map.cli.console import (
     print_many,
-    print_merged,
     print_run,
     progress_bars,
     refuse_unlabelled,
@@ -243,27 +242,6 @@ def remove(
         )  # fmt: skip
     warn([*made.about["warnings"], *_labels_gone(had_labels)])
     print_many(made.about, out, as_json)
-
-
-def merge(
-    first: Annotated[Path, typer.Argument(help="Folder of a run; the merged map has its frame.")],
-    second: Annotated[Path, typer.Argument(help="Folder of another run, of the same place.")],
-    out: Out,
-    match: Annotated[
-        bool,
-        typer.Option(help="Register the second map to the first, because both positions have errors."),
-    ] = True,
-    as_json: Json = False,
-) -> None:
-    """Merge two runs of the same place into one map, refined again."""
-    from gnss_sem_map.runs.merged_run import merge_run_folders
-
-    about = merge_run_folders(first, second, out, match)
-    warn(about["warnings"])
-    if as_json:
-        typer.echo(json.dumps(about))
-    else:
-        print_merged(about, out)
 
 
 def trajectory(

@@ -330,10 +330,6 @@ def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:
     run_folder.georeference_of(settings, frame)
     if is_folder(out / DRIVES):
         return settings, frame, {path.name: path for path in sorted((out / DRIVES).iterdir())}
-    if "merged" in about:
-        raise DataError(
-            f"{shown(out)}: was merged by `merge` and keeps no drives; expected a map of `gnss-sem-map run`"
-        )
     name = about.get("drive")
     if not isinstance(name, str) or Path(name).name != name or name in ("", ".."):
         raise DataError(f"{shown(out / 'run.json')}: damaged (drive: found {name!r}, expected a name)")

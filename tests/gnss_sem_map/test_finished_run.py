@@ -27,10 +27,9 @@ from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings
-from gnss_sem_map.runs import calibrating, finished_run, merged_run
+from gnss_sem_map.runs import calibrating, finished_run
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.classifier_fitting import fit_classifier
-from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import State
@@ -285,13 +284,12 @@ def replaced(out: Path, **files: str) -> None:
             (folder / f"{name}.yaml").write_text(text)
 
 
-@pytest.mark.parametrize("command", ["refine", "relabel", "merge", "export", "calibrate"])
+@pytest.mark.parametrize("command", ["refine", "relabel", "export", "calibrate"])
 def test_a_run_that_another_command_replaces_while_it_is_read_is_no_source(
-    command: str, merged: Run, small_drive: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, finished: Run, small_drive: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else the map of one run and the trajectory of another would be written as one, without a word."""
-    whole, to = merged.folder.parent, tmp_path / "to"
-    out, other = Run.open(shutil.copytree(whole / "a", tmp_path / "out")), whole / "b"
+    out, to = Run.open(shutil.copytree(finished.folder, tmp_path / "out")), tmp_path / "to"
     times = []
 
     def another(*_: object) -> None:
@@ -301,12 +299,11 @@ def test_a_run_that_another_command_replaces_while_it_is_read_is_no_source(
     def beside(original: Callable[..., object]) -> Callable[..., object]:
         return lambda *words, **named: (another(), original(*words, **named))[1]
 
-    for module, name in ((pipeline, "refine"), (merged_run, "refine_map"), (calibrating, "open_segmenter")):
+    for module, name in ((pipeline, "refine"), (calibrating, "open_segmenter")):
         monkeypatch.setattr(module, name, beside(getattr(module, name)))
     commands: dict[str, Callable[[], object]] = {
         "refine": lambda: out.refine(out.settings, to),
         "relabel": lambda: out.relabel(f"labels:{small_drive.labels}", to),
-        "merge": lambda: merged_run.merge_run_folders(other, out.folder, to, match=False),
         "export": lambda: out.export(["ply", "laz"], to, progress=another),
         "calibrate": lambda: calibrating.calibrate([(out.folder, small_drive.labels)]),
     }
@@ -328,39 +325,6 @@ def test_a_run_is_refined_as_it_is_and_not_as_it_was_when_it_was_opened(
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no run folder"):
         Run.open(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def merged(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    folder = tmp_path_factory.mktemp("merged")
-    for name, frames in (("a", "0:6"), ("b", "6:12")):
-        run(small_drive.drive, folder / name, f"labels:{small_drive.labels}", frames=frames, force=True)
-    merge_run_folders(folder / "a", folder / "b", folder / "merged", match=False)
-    return Run.open(folder / "merged")
-
-
-def test_a_merged_run_is_read_refined_and_exported(merged: Run, tmp_path: Path) -> None:
-    whole = merged.map()
-    low, high = whole.voxels.centres.min(axis=0), whole.voxels.centres.mean(axis=0)
-    assert 0 < len(merged.map((low, high))) < len(whole)
-    again = merged.refine(merged.settings, tmp_path / "again")
-    assert again.is_merged
-    assert files(again.folder) == files(merged.folder)
-    assert again.about == merged.about
-    other = with_refinement(merged.settings, potts_mrf={"enabled": False})
-    changed = again.refine(other)
-    assert changed.settings == other
-    assert files(changed.folder / "map") == files(merged.folder / "map")
-    assert files(changed.folder / "refined") != files(merged.folder / "refined")
-    [ply] = merged.export(["ply"], tmp_path / "files")
-    assert ply.read_bytes() == (merged.folder / "map.ply").read_bytes()
-
-
-def test_a_merged_run_has_no_trajectory_and_cannot_be_relabelled(merged: Run, small_drive: Street) -> None:
-    with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for trajectory"):
-        _ = merged.trajectory
-    with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for relabelling"):
-        merged.relabel(f"labels:{small_drive.labels}")
 
 
 def test_points_of_other_have_its_id_and_run_json_counts_its_voxels(finished: Run, tmp_path: Path) -> None:

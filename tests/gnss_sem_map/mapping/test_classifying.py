@@ -27,7 +27,6 @@ from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.run_stats import silent
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
-from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.voxels import blocks
 from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
@@ -381,15 +380,3 @@ def test_runs_without_labels_teach_nothing(street_run: Run, tmp_path: Path) -> N
         "fit-classifier: images label nothing; give runs that were made with --segmenter"
     )
     assert not (tmp_path / "new.npz").exists()
-
-
-@pytest.mark.slow
-def test_a_merged_run_has_a_classifier_of_its_own_and_is_the_same_when_refined_again(
-    both: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "merged"
-    merge_run_folders(both / "drives/a", both / "drives/b", out, match=False)
-    merged = Run.open(out)
-    assert inferred(merged.map()).sum() > 1000
-    again = merged.refine(merged.settings, tmp_path / "again")
-    assert refined(again.folder) == refined(out)

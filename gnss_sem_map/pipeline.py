@@ -41,6 +41,7 @@ from gnss_sem_map.mapping.trajectory import (
     Matcher,
     RegistrarOf,
     check_georeference,
+    check_heights,
     estimate_trajectory,
     in_frame,
     locate,
@@ -149,6 +150,7 @@ def run(
         log, segmenter, settings, stats, progress, force, match, registrar_of, saved, bound=correction is None
     )
     located = _in_map(log, found, origin, correction)
+    check_heights(log.name, located.trajectory, settings.mapping.voxel_size_m)
     passes, from_lidar_odometry = found.passes, found.from_lidar_odometry
     del found
     if write is not None:

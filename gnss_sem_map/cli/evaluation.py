@@ -38,6 +38,7 @@ def evaluate(
     from gnss_sem_map.evaluation.score_run import score_run
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.files.output_folder import locked, real_path
+    from gnss_sem_map.files.ownership import is_as_written
     from gnss_sem_map.files.run_json import read_run
     from gnss_sem_map.files.untrusted import shown
 
@@ -46,6 +47,8 @@ def evaluate(
         try:
             write_report(run_folder, read_run(run_folder), metrics)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            if is_as_written(run_folder, "run.json"):
+                raise  # an error of ours
             raise DataError(
                 f"{shown(run_folder / 'run.json')}: damaged ({type(error).__name__} {error}); make the run again"
             ) from None

@@ -206,17 +206,20 @@ class _Workers:
 
 
 def _nthreads(client: Client, address: str) -> dict[str, int]:
-    with _scheduler_there(address):
+    with _scheduler_there(client, address):
         return dict(client.nthreads())
 
 
 @contextmanager
-def _scheduler_there(address: str) -> Iterator[None]:
+def _scheduler_there(client: Client, address: str) -> Iterator[None]:
     """Raise DataError when the scheduler is lost while it is asked."""
     try:
         yield
-    # CommClosedError is an OSError; a client that was closed has no scheduler
-    except (OSError, AttributeError, CancelledError):
+    except (OSError, AttributeError, CancelledError) as error:  # CommClosedError is an OSError
+        if (
+            isinstance(error, AttributeError) and client.scheduler is not None
+        ):  # a client that was closed has none
+            raise
         raise DataError(f"scheduler {address}: was lost; see that it runs, and --resume") from None
 
 
@@ -273,7 +276,7 @@ def _refuse_without_certificates(address: str) -> None:
 
 
 def _wait_for_worker(client: Client, address: str) -> None:
-    with _scheduler_there(address):
+    with _scheduler_there(client, address):
         try:
             client.wait_for_workers(1, timeout=FIRST_WORKER_S)
         except TimeoutError:
@@ -292,7 +295,7 @@ def _asked(
     there = sorted(_nthreads(client, address).keys() & workers)
     if not there:
         return {}
-    with _scheduler_there(address):
+    with _scheduler_there(client, address):
         said = client.run(function, *arguments, workers=there, on_error="return")
     for worker, one in said.items():
         if isinstance(one, Exception) and not isinstance(one, OSError):

@@ -199,6 +199,17 @@ def check_georeference(log: SensorLog, origin: LocalFrame | None, voxel_size_m: 
         )
 
 
+def check_heights(name: str, trajectory: Trajectory, voxel_size_m: float) -> None:
+    """Raise DataError for a drive of this name that goes higher or lower than a map has voxels."""
+    up, highest_m = trajectory.positions[:, 2], voxel_size_m * Z_OFFSET
+    if len(up) and max(-up.min(), up.max()) >= highest_m:
+        raise DataError(
+            f"{name}: lies between {up.min():.0f} and {up.max():.0f} m over the origin of the map, expected less than"
+            f" +-{highest_m:.0f} m with voxels of {voxel_size_m:g} m; choose a larger mapping.voxel_size_m, or see to"
+            " the heights of the poses"
+        )
+
+
 def smooth_log(
     log: SensorLog, settings: TrajectorySettings, relative_poses: RelativePoses | None = None
 ) -> Solution:

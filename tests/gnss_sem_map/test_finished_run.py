@@ -16,13 +16,16 @@ import numpy as np
 import pyogrio
 import pytest
 from street import Street
+from typer.testing import CliRunner
 
 from gnss_sem_map import Run, Settings, pipeline
+from gnss_sem_map.cli import app
 from gnss_sem_map.cli.options import delivered_in
 from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.output_folder import locked, new_folder
-from gnss_sem_map.files.ownership import MARKER
+from gnss_sem_map.files.ownership import MARKER, amend
+from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
@@ -430,3 +433,18 @@ def test_the_coordinates_of_all_files_change_together_and_the_map_stays(
     assert len(laspy.read(copc).points) == len(laspy.read(again.folder / "map.laz").points)
     with pytest.raises(ConfigError, match=r"EPSG:27700 is for"):
         finished.refine(finished.settings.changed("delivery.crs=27700"), tmp_path / "elsewhere")
+
+
+def test_an_error_of_the_report_is_blamed_on_run_json_only_where_somebody_changed_it(
+    small_drive: Street, finished: Run, tmp_path: Path
+) -> None:
+    out = shutil.copytree(finished.folder, tmp_path / "out")
+    truth = tmp_path / "truth"
+    shutil.copytree(out / "labels", truth)
+    wrong = json.dumps(read_run(out) | {"warnings": 5}).encode()
+    amend(out, "run.json", wrong)  # as if we had written it so
+    words = ["evaluate", str(out), "--truth", str(truth)]
+    assert isinstance(CliRunner().invoke(app, words).exception, TypeError)
+    (out / "run.json").write_bytes(wrong + b" ")
+    with pytest.raises(DataError, match=r"run.json: damaged \(TypeError"):
+        CliRunner().invoke(app, words, catch_exceptions=False)

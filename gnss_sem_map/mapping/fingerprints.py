@@ -93,8 +93,8 @@ def _classes(drive: Drive) -> list[Any]:
 
 
 def _classes_of_map(label_set: LabelSet) -> list[Any]:
-    """The classes of the map, and which those of a network are; their file may be changed under its name."""
-    return [label_set.names, label_set.sources]
+    """The classes of the map, their roles, and which those of a network are; their file may be changed."""
+    return [label_set.names, label_set.sources, label_set.roles]
 
 
 def _scans(log: SensorLog) -> list[Any]:

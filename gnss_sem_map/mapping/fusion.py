@@ -111,6 +111,8 @@ def without_images(settings: Settings) -> str:
 
 
 def _warn(drive: Drive, stats: RunStats) -> None:
+    if said := drive.label_set.said_of_roles:
+        stats.warnings.append(said)
     if drive.log.images and not drive.log.cameras:
         stats.warnings.append(
             f"{drive.log.name}: no camera is described, so its {len(drive.log.images)} images are not used:"

@@ -39,7 +39,7 @@ from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
-from gnss_sem_map.mapping.moving_points import MOVABLE
+from gnss_sem_map.labels.roles import MOVABLE
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
 from gnss_sem_map.pipeline import Located, Mapped
@@ -138,7 +138,8 @@ def write_drive(
 
 def write_objects(folder: Path, name: str, mapped: Mapped, settings: Settings) -> None:
     """Write what moved in a drive of this name."""
-    movable = [each for each in open_label_set(settings.classes).names if each in MOVABLE]
+    label_set = open_label_set(settings.classes)
+    movable = {label_set.names[label]: str(label_set.roles[label]) for label in label_set.having(*MOVABLE)}
     log = mapped.log
     write_movers(movers_of(mapped.objects, movable), DriveOfMovers(name, log.epoch_ns, log.frame), folder)
 

@@ -20,17 +20,14 @@ from factor_graphs.corrections import Correction
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import preflight
 from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.motion_state import TrackedObject
-from gnss_sem_map.evaluation import preflight
 from gnss_sem_map.evaluation.map_sharpness import Sharpness, SweepSample, of_sample
-from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.files.work_folder import SWEEPS
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.machine import one_blas_thread
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.classifying import fit_classifiers, opened_model
-from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.fusion import Elsewhere, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, pattern_sweeps
 from gnss_sem_map.mapping.passes import TwoPasses
@@ -47,8 +44,11 @@ from gnss_sem_map.mapping.trajectory import (
     locate,
     matches_scans,
 )
-from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError
+from gnss_sem_map.process.execution import Executor
+from gnss_sem_map.process.machine import one_blas_thread
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.kept_sweeps import KeptSweeps
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels

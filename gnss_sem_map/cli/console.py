@@ -15,8 +15,8 @@ from gnss_sem_map.errors import counted
 
 if TYPE_CHECKING:
     from gnss_sem_map.datasets.ros.contents import Topic
-    from gnss_sem_map.evaluation.preflight.findings import Preflight
-    from gnss_sem_map.run_stats import Progress
+    from gnss_sem_map.preflight.findings import Preflight
+    from gnss_sem_map.process.run_stats import Progress
     from gnss_sem_map.segmentation.cache import CacheReport
     from gnss_sem_map.sensor_log import Skip
 

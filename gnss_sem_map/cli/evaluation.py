@@ -126,9 +126,9 @@ def check(
     as_json: Json = False,
 ) -> None:
     """Pre-flight: check a log against physics, and its sensors against each other; exit code 1 if a check is red."""
-    from gnss_sem_map.evaluation import preflight
-    from gnss_sem_map.evaluation.preflight.findings import Level
+    from gnss_sem_map import preflight
     from gnss_sem_map.labels.label_set import open_label_set
+    from gnss_sem_map.preflight.findings import Level
     from gnss_sem_map.runs.check_page import check_writable, write_check_page
     from gnss_sem_map.segmentation import open_segmenter
 

@@ -30,8 +30,8 @@ from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
-from gnss_sem_map.machine import threads
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
 
 """Largest stamp in s and length in m."""
 

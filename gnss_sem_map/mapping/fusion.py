@@ -22,8 +22,8 @@ from gnss_sem_map.mapping.chunks import BLURRED, chunks_of, map_chunks
 from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
-from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.sensor_log import Skip
 
 GEOMETRY_ONLY = "the map shows geometry only"

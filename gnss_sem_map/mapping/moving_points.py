@@ -15,8 +15,8 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.roles import MOVABLE
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, map_points
+from gnss_sem_map.process.prefetch import prefetch
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan
 
 

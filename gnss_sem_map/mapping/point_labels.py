@@ -16,12 +16,12 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.labels.roles import MOVABLE
-from gnss_sem_map.machine import threads
 from gnss_sem_map.mapping.evidence import read_moving_points
 from gnss_sem_map.mapping.labelled_scans import Drive, map_points
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import TiledMap

@@ -19,8 +19,8 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes, count_passes
-from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
 from gnss_sem_map.scans.local_maps import sweeps_along
 from gnss_sem_map.scans.revisits import Registrar

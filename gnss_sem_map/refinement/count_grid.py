@@ -13,10 +13,10 @@ from pydantic import Field
 from scipy.special import gammaln
 
 from gnss_sem_map.labels.roles import Role
-from gnss_sem_map.machine import threads
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.thread_pools import thread_pool
 from gnss_sem_map.refinement.figures import FIXED_POINT, PSEUDO_COUNTS, Sums
 from gnss_sem_map.refinement.state import MapState, StepSettings, classes_of
-from gnss_sem_map.thread_pools import thread_pool
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21

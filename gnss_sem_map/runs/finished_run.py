@@ -44,7 +44,7 @@ from gnss_sem_map.mapping.classifying import OFF
 from gnss_sem_map.mapping.fusion import without_images
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.about import about_map, about_skips, with_objects
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks

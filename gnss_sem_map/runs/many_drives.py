@@ -30,10 +30,10 @@ from gnss_sem_map.files.output_folder import Claim, refuse_locked
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES, REMOVED
-from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.trajectory import check_georeference
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.execution import InProcess
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, KnownTrack, bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import failed_before, map_all, save_failed

@@ -31,8 +31,8 @@ from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import MATCHES, SWEEPS
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.execution import Executor, Task, path_of, run_tasks
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_section, sections_of

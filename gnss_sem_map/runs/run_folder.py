@@ -19,7 +19,6 @@ from factor_graphs.trajectory import Trajectory
 from factor_graphs.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.dynamics.movers import movers_of
-from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.dates import are_dates
 from gnss_sem_map.export.exported import Exported, sure_part
 from gnss_sem_map.export.formats import write_exports
@@ -43,7 +42,9 @@ from gnss_sem_map.labels.roles import MOVABLE
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
 from gnss_sem_map.pipeline import Located, Mapped
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.preflight.findings import Preflight
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
+from gnss_sem_map.process.thread_pools import leaving_all
 from gnss_sem_map.runs.about import (
     about_map,
     about_mapped,
@@ -57,7 +58,6 @@ from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_label
 from gnss_sem_map.runs.run_settings import COPIES, write_settings
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
-from gnss_sem_map.thread_pools import leaving_all
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import open_attributes
 

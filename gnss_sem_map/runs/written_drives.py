@@ -29,7 +29,7 @@ from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.bound_drives import BoundDrives
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels

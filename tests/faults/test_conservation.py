@@ -26,7 +26,7 @@ from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_folder import about_run
 from gnss_sem_map.segmentation import Segmenter

@@ -30,7 +30,7 @@ from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import MOVING_POINTS, REMOVED, STATIC, ChunkStore
 from gnss_sem_map.mapping.fusion import map_range, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 
@@ -73,7 +73,7 @@ MAP = """
 import sys
 from pathlib import Path
 from gnss_sem_map.mapping import fusion
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels.label_set import open_label_set
@@ -334,7 +334,7 @@ from gnss_sem_map.errors import DataError
 from test_tiles import random_map, FRAME
 from gnss_sem_map.mapping import checkpoints
 from gnss_sem_map.mapping.chunks import MappedChunk
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import NOTHING
 from gnss_sem_map.labels.label_set import open_label_set

@@ -23,9 +23,9 @@ from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import classifying, refining
 from gnss_sem_map.mapping.classifying import FILE, DriveClassifier
-from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import open_raw
-from gnss_sem_map.run_stats import silent
+from gnss_sem_map.process.execution import InProcess
+from gnss_sem_map.process.run_stats import silent
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
 from gnss_sem_map.voxels import blocks
 from gnss_sem_map.voxels.map_json import name_of

@@ -11,7 +11,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.trajectory import check_heights, locate, smooth_log
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.sensor_log import Points, SensorLog
 from gnss_sem_map.voxels.tile_files import local_keys
 from gnss_sem_map.voxels.voxel_map import keys_of

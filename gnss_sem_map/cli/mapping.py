@@ -255,9 +255,8 @@ def trajectory(
     as_json: Json = False,
 ) -> None:
     """Make only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
-    from gnss_sem_map import pipeline
     from gnss_sem_map.process.run_stats import RunStats
-    from gnss_sem_map.runs import run_folder
+    from gnss_sem_map.runs import pipeline, run_folder
     from gnss_sem_map.runs.source import source_of
 
     settings = settings_of(config, set_)

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
@@ -45,7 +44,7 @@ from gnss_sem_map.mapping.fusion import without_images
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
-from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs import pipeline, run_folder
 from gnss_sem_map.runs.about import about_map, about_skips, with_objects
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of

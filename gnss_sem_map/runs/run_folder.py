@@ -41,7 +41,6 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.labels.roles import MOVABLE
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
-from gnss_sem_map.pipeline import Located, Mapped
 from gnss_sem_map.preflight.findings import Preflight
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.process.thread_pools import leaving_all
@@ -54,6 +53,7 @@ from gnss_sem_map.runs.about import (
     seconds_of,
     with_objects,
 )
+from gnss_sem_map.runs.pipeline import Located, Mapped
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_settings import COPIES, write_settings
 from gnss_sem_map.runs.source import Source, source_of

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.export.changes import write_changes
 from gnss_sem_map.export.georeference import Georeference
@@ -30,6 +29,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.bound_drives import BoundDrives
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels

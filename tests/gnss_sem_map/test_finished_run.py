@@ -18,7 +18,7 @@ import pytest
 from street import Street
 from typer.testing import CliRunner
 
-from gnss_sem_map import Run, Settings, pipeline
+from gnss_sem_map import Run, Settings
 from gnss_sem_map.cli import app
 from gnss_sem_map.cli.options import delivered_in
 from gnss_sem_map.config import DeliverySettings
@@ -32,7 +32,7 @@ from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings
-from gnss_sem_map.runs import calibrating, finished_run
+from gnss_sem_map.runs import calibrating, finished_run, pipeline
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.classifier_fitting import fit_classifier
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels

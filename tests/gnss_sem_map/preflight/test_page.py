@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.pipeline import run
 from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError, amber, green, red
 from gnss_sem_map.runs.check_page import check_writable, write_check_page
+from gnss_sem_map.runs.pipeline import run
 
 RED = red("IMU axes", "mean specific force -9.8 m/s² along z", "z points down: FRD?", "set imu_axes: frd")
 AMBER = amber("GNSS", "5 % of the fixes stand still", "frozen receiver", "leave them out")

@@ -80,6 +80,8 @@ class LabelSet:
                 f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one for every class,"
                 f" none of them 0, which is a point without a class, or {OTHER_SEMANTIC_KITTI_ID}, which is `other`"
             )
+        if len(self.roles) != count:
+            raise ConfigError(f"class set {self.name!r}: found {len(self.roles)} roles for {count} classes")
         for role in OF_ONE_CLASS:
             if len(those := [self.names[i] for i in self.having(role)]) > 1:
                 raise ConfigError(

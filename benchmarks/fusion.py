@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from real_data import DATA
 from results_file import RESULTS, keep
 
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.label_files import label_files, read_labels
@@ -35,6 +34,7 @@ from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.point_labels import label_points
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate

@@ -40,7 +40,7 @@ from gnss_sem_map.mapping import labelled_scans
 from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan
 from gnss_sem_map.mapping.raw_map import write_raw
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.scans.projection import ClassImage, class_image, image_exposed_at
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog

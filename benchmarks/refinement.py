@@ -46,11 +46,11 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.chunks import MappedChunk, chunks_of, map_chunks
 from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
-from gnss_sem_map.pipeline import estimate_trajectory
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.pipeline import estimate_trajectory
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import keys_of, unpack

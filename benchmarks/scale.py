@@ -198,7 +198,7 @@ def refinement(drives: Drives, out: Path) -> Figures:
         "import shutil, sys, time\n"
         "from pathlib import Path\n"
         "from tempfile import TemporaryDirectory\n"
-        "from gnss_sem_map import config, pipeline\n"
+        "from gnss_sem_map import config\nfrom gnss_sem_map.runs import pipeline\n"
         "from gnss_sem_map.labels.label_set import open_label_set\n"
         "from gnss_sem_map.mapping.raw_map import open_raw\n"
         "from gnss_sem_map.mapping.refining import refine_map\n"

@@ -40,7 +40,7 @@ from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, of_clouds
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping.passes import LocatedDrive, bind_passes
 from gnss_sem_map.mapping.trajectory import in_frame, locate
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.runs.many_drives import HowMapped, run_drives
 from gnss_sem_map.scans.deskew import points_in_map
 from gnss_sem_map.scans.downsampling import thinned

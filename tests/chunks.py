@@ -11,7 +11,7 @@ import numpy as np
 from gnss_sem_map.mapping.checkpoints import REMOVED, STATIC
 from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 

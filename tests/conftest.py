@@ -38,7 +38,7 @@ INTEGRATION_FILES = tuple(
         "faults",
         "gnss_sem_map/datasets/test_kitti_360.py",
         "gnss_sem_map/dynamics/test_moving_objects.py",
-        "gnss_sem_map/evaluation/preflight",
+        "gnss_sem_map/preflight",
         "gnss_sem_map/export/test_every_writer.py",
         "gnss_sem_map/export/test_pictures.py",
         "gnss_sem_map/many_drives",

@@ -10,9 +10,9 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.simulation import random_drive, simulate_gnss, simulate_imu
 from gnss_sem_map import config
-from gnss_sem_map.evaluation.preflight import inertial, positions
-from gnss_sem_map.evaluation.preflight.findings import Finding, Level
-from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.preflight import inertial, positions
+from gnss_sem_map.preflight.findings import Finding, Level
+from gnss_sem_map.preflight.sample import Sample
 from gnss_sem_map.sensor_log import Calibration, SensorLog
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 

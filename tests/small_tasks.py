@@ -12,8 +12,8 @@ import numpy as np
 from threadpoolctl import threadpool_info
 
 from gnss_sem_map.errors import DataError, WriteError
-from gnss_sem_map.machine import threads
-from gnss_sem_map.mapping.execution import failure_of
+from gnss_sem_map.process.execution import failure_of
+from gnss_sem_map.process.machine import threads
 
 
 def times(a: float, b: float) -> float:

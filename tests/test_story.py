@@ -305,26 +305,14 @@ def test_segmenting_lists_class_names_that_nobody_knows(small_drive: Street, tmp
     assert done.stderr.splitlines().count(said.format(spec)) == 1
 
 
-def test_a_run_is_not_merged_with_itself(raw_run: Path, tmp_path: Path) -> None:
-    link = tmp_path / "link"
-    link.symlink_to(raw_run)
-    for second in (raw_run, link):
-        assert "is the first run as well" in refused("merge", raw_run, second, "-o", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_what_cannot_be_evaluated_says_what_is_missing_and_what_to_do(
     raw_run: Path, small_drive: Street, tmp_path: Path
 ) -> None:
-    again, merged, track = (tmp_path / name for name in ("again", "merged", "track"))
+    again, track = tmp_path / "again", tmp_path / "track"
     shutil.copytree(raw_run, again)
-    about = json.loads((again / "run.json").read_text())
-    (again / "run.json").write_text(json.dumps(about | {"drive": "other", "inputs": {"drive": "/elsewhere"}}))
-    assert gnss_sem_map("merge", raw_run, again, "-o", merged).returncode == 0
     assert gnss_sem_map("trajectory", small_drive.drive, "-o", track).returncode == 0
     shutil.rmtree(again / "labels")
     for folder, missing, what_to_do in (
-        (merged, "a merged map has no labels", f"evaluate the runs that it was made of, {raw_run.name} and again"),
         (track, "a trajectory without a map", "gnss-sem-map run ... --write-labels"),
         (again, "no point labels in this run", "make it again with --write-labels"),
         (tmp_path / "nowhere", "no run folder here", "expected the -o of an earlier `gnss-sem-map run`"),

@@ -27,14 +27,13 @@ from gnss_sem_map.cli import (
 from gnss_sem_map.cli.signals import Stopped, caused_by_signal, ignore_signals
 from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.files.ownership import MARKER
-from gnss_sem_map.machine import BLAS_THREADS_VARIABLE
-from gnss_sem_map.memory import collect_seldom, share_one_heap, use_huge_pages
+from gnss_sem_map.process.machine import BLAS_THREADS_VARIABLE
+from gnss_sem_map.process.memory import collect_seldom, share_one_heap, use_huge_pages
 
 COMMANDS = (
     mapping.run,
     mapping.add,
     mapping.remove,
-    mapping.merge,
     mapping.trajectory,
     finished.refine,
     finished.relabel,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gnss_sem_map.cli.logs import STAGES
-from gnss_sem_map.machine import cores
+from gnss_sem_map.process.machine import cores
 
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher

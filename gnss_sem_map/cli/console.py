@@ -15,8 +15,8 @@ from gnss_sem_map.errors import counted
 
 if TYPE_CHECKING:
     from gnss_sem_map.datasets.ros.contents import Topic
-    from gnss_sem_map.evaluation.preflight.findings import Preflight
-    from gnss_sem_map.run_stats import Progress
+    from gnss_sem_map.preflight.findings import Preflight
+    from gnss_sem_map.process.run_stats import Progress
     from gnss_sem_map.segmentation.cache import CacheReport
     from gnss_sem_map.sensor_log import Skip
 
@@ -118,22 +118,6 @@ def print_many(about: dict[str, Any], out: Path, as_json: bool) -> None:
         )
         _print_passes(about)
     warn(f"{name} is left out: {reason}" for name, reason in about["failed"].items())
-
-
-def print_merged(about: dict[str, Any], out: Path) -> None:
-    """Size of the merged map and alignment of the second run to the first; a failed registration on stderr."""
-    match, (first, second) = about["match"], about["merged"]
-    before, after = (_percent(match["overlap"][moment]) for moment in ("by_georeference", "aligned"))
-    typer.echo(f"{about['name']}: {about['map']['voxels']} voxels")
-    if match["shift_m"] is not None:
-        typer.echo(
-            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {after} % of its voxels"
-            f" overlap {first}, by georeference {before} %"
-        )
-    else:
-        typer.echo(f"{second} is aligned by its georeference alone: {after} % of its voxels overlap {first}")
-        warn([f"{second} could not be registered to {first}: {match['reason']}"] if match["reason"] else [])
-    typer.echo(f"results in {out}")
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:

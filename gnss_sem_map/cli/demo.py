@@ -16,7 +16,7 @@ from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.export.report import write_report
 from gnss_sem_map.files.output_folder import claimed, new_folder, real_path
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.run_folder import claimed_run
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter

@@ -38,6 +38,7 @@ def evaluate(
     from gnss_sem_map.evaluation.score_run import score_run
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.files.output_folder import locked, real_path
+    from gnss_sem_map.files.ownership import is_as_written
     from gnss_sem_map.files.run_json import read_run
     from gnss_sem_map.files.untrusted import shown
 
@@ -46,6 +47,8 @@ def evaluate(
         try:
             write_report(run_folder, read_run(run_folder), metrics)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            if is_as_written(run_folder, "run.json"):
+                raise  # an error of ours
             raise DataError(
                 f"{shown(run_folder / 'run.json')}: damaged ({type(error).__name__} {error}); make the run again"
             ) from None
@@ -123,9 +126,9 @@ def check(
     as_json: Json = False,
 ) -> None:
     """Pre-flight: check a log against physics, and its sensors against each other; exit code 1 if a check is red."""
-    from gnss_sem_map.evaluation import preflight
-    from gnss_sem_map.evaluation.preflight.findings import Level
+    from gnss_sem_map import preflight
     from gnss_sem_map.labels.label_set import open_label_set
+    from gnss_sem_map.preflight.findings import Level
     from gnss_sem_map.runs.check_page import check_writable, write_check_page
     from gnss_sem_map.segmentation import open_segmenter
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars, warn
+from gnss_sem_map.cli.console import print_many, print_run, progress_bars, warn
 from gnss_sem_map.cli.options import Crs, Device, Geoid, Json, Set, delivered_in
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ def refine(
     _warn_of_coordinates(again, again.settings)
     if "drives" in about:
         print_many(about, again.folder, as_json)
-    elif again.is_merged and not as_json:
-        print_merged(about, again.folder)
     else:
         print_run(about, again.folder, as_json, ("refinement", "labels", "export"))
 

@@ -1,4 +1,4 @@
-"""Commands that make a map or a trajectory: `run`, `add`, `remove`, `merge`, `trajectory`."""
+"""Commands that make a map or a trajectory: `run`, `add`, `remove`, `trajectory`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import typer
 
 from gnss_sem_map.cli.console import (
     print_many,
-    print_merged,
     print_run,
     progress_bars,
     refuse_unlabelled,
@@ -245,27 +244,6 @@ def remove(
     print_many(made.about, out, as_json)
 
 
-def merge(
-    first: Annotated[Path, typer.Argument(help="Folder of a run; the merged map has its frame.")],
-    second: Annotated[Path, typer.Argument(help="Folder of another run, of the same place.")],
-    out: Out,
-    match: Annotated[
-        bool,
-        typer.Option(help="Register the second map to the first, because both positions have errors."),
-    ] = True,
-    as_json: Json = False,
-) -> None:
-    """Merge two runs of the same place into one map, refined again."""
-    from gnss_sem_map.runs.merged_run import merge_run_folders
-
-    about = merge_run_folders(first, second, out, match)
-    warn(about["warnings"])
-    if as_json:
-        typer.echo(json.dumps(about))
-    else:
-        print_merged(about, out)
-
-
 def trajectory(
     drive: Drive,
     out: Out,
@@ -277,9 +255,8 @@ def trajectory(
     as_json: Json = False,
 ) -> None:
     """Make only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
-    from gnss_sem_map import pipeline
-    from gnss_sem_map.run_stats import RunStats
-    from gnss_sem_map.runs import run_folder
+    from gnss_sem_map.process.run_stats import RunStats
+    from gnss_sem_map.runs import pipeline, run_folder
     from gnss_sem_map.runs.source import source_of
 
     settings = settings_of(config, set_)

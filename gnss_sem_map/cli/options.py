@@ -161,6 +161,6 @@ def frame_of(origin: str | None) -> LocalFrame | None:
 
 def default_workers() -> int:
     """All cores but one, as long as each worker, and this process, has enough memory."""
-    from gnss_sem_map.machine import cores, memory_bytes
+    from gnss_sem_map.process.machine import cores, memory_bytes
 
     return max(min(cores(), memory_bytes() // WORKER_BYTES) - 1, 1)

@@ -7,7 +7,7 @@ part of it that was a segment of its own: the front of a lorry, of which a pole 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +60,8 @@ class Mover:
     """LiDARs that saw it, by name."""
     name: str
     """Its class."""
+    kind: str
+    """What that is: the role of the class, or one of `SHAPES`."""
     is_labelled: bool
     """Labels tell its class; else its shape does."""
     labelled: float
@@ -90,7 +92,7 @@ class Mover:
         """
         length, width, height = self.size_m
         possible = LORRY_M if height > HIGHEST_CAR_M else CAR_M
-        unseen = max(possible - length, 0.0) / 2 if self.name in (VEHICLE, UNKNOWN) else 0.0
+        unseen = max(possible - length, 0.0) / 2 if self.kind in (VEHICLE, UNKNOWN) else 0.0
         outline = OUTLINE_STDDEV_M**2 + (OUTLINE_STDDEV_RATIO * max(length, width)) ** 2
         ahead = courses(self.track.positions)
         return np.asarray(np.sqrt(self.track.position_variances + outline + (unseen * ahead) ** 2))
@@ -133,10 +135,10 @@ class Mover:
         return np.asarray(np.degrees(np.arctan2(*self.track.velocities.T)) % 360)
 
 
-def movers_of(objects: Sequence[TrackedObject], movable: Sequence[str]) -> tuple[Mover, ...]:
+def movers_of(objects: Sequence[TrackedObject], movable: Mapping[str, str]) -> tuple[Mover, ...]:
     """The movers among tracked objects, by the time when they were first seen.
 
-    `movable` are the classes of the class set that may move.
+    `movable` are the classes of the class set that may move, with their roles.
     """
     moved = [one for one in objects if one.motion in GONE and one.track is not None]
     movers = [_mover([moved[n] for n in group], movable) for group in _same(moved)]
@@ -149,7 +151,7 @@ def _without_parts(movers: Sequence[Mover]) -> list[Mover]:
     starts, ends, points = (
         np.array([(one.stamps[0], one.stamps[-1], one.points) for one in movers]).reshape(-1, 3).T
     )
-    is_large = np.array([one.name == VEHICLE or max(one.size_m[:2]) > SMALL_M for one in movers], np.bool_)
+    is_large = np.array([one.kind == VEHICLE or max(one.size_m[:2]) > SMALL_M for one in movers], np.bool_)
 
     def is_part(one: Mover) -> bool:
         may_hold = (starts < one.stamps[-1]) & (ends > one.stamps[0]) & (points > one.points) & is_large
@@ -169,7 +171,7 @@ def _holds(whole: Mover, part: Mover) -> bool:
     along, across = abs(east * off[:, 0] + north * off[:, 1]), abs(east * off[:, 1] - north * off[:, 0])
     length, width, _ = whole.size_m
     reach_m = length / 2 + PART_MARGIN_M
-    if whole.name == VEHICLE and part.name in (VEHICLE, UNKNOWN):
+    if whole.kind == VEHICLE and part.kind in (VEHICLE, UNKNOWN):
         reach_m = max(reach_m, SHORTEST_M)
     inside = (at >= whole.stamps[0]) & (at <= whole.stamps[-1])
     inside &= (along <= reach_m) & (across <= width / 2)
@@ -211,7 +213,7 @@ def _are_one(first: TrackedObject, second: TrackedObject) -> bool:
     return bool(np.median(np.hypot(*off)) < SAME_M)
 
 
-def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
+def _mover(objects: Sequence[TrackedObject], movable: Mapping[str, str]) -> Mover:
     """One mover of its tracks; what chunks have in common counts once."""
     tracks = [_track(one) for one in objects]
     stamps = np.concatenate([t.stamps for t in tracks])
@@ -229,9 +231,13 @@ def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
     is_labelled = labelled >= LEAST_LABELLED and len(movable) == 1
     track = smooth(stamps, positions[:, :2], variances)
     speed_mps = float(np.median(np.linalg.norm(track.velocities, axis=1)))
+    name = kind = class_by_shape(size, speed_mps)
+    if is_labelled:
+        [(name, kind)] = movable.items()
     return Mover(
         lidars=tuple(sorted({one.lidar for one in objects})),
-        name=movable[0] if is_labelled else class_by_shape(size, speed_mps),
+        name=name,
+        kind=kind,
         is_labelled=is_labelled,
         labelled=labelled,
         motion=main.motion,

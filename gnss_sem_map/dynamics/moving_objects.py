@@ -37,7 +37,7 @@ from gnss_sem_map.dynamics.visibility import (
     spatial_order,
 )
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.memory import release_memory
+from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.voxels.hash_unique import distinct
 
 Array = NDArray[np.float64]

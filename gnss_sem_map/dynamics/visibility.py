@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.image_rows import Rows
-from gnss_sem_map.machine import threads
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
 from gnss_sem_map.scans.own_vehicle import returns_of
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.voxels.voxel_map import limits_of
 
 THREADS = min(threads(), 4)

@@ -14,11 +14,11 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.metrics import Tables
 from gnss_sem_map.labels.sensor_model import CELLS, CalibrationDrive, cells_of
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.refinement.by_block import run_steps
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.potts_mrf import LEAST_PROBABILITY
 from gnss_sem_map.refinement.systematic_error import doubted
-from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.voxels.voxel_map import VoxelMap, softmax
 
 LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE = 0.5, 20.0

@@ -21,9 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.prefetch import prefetch
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, usable_points_in_map
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
 from gnss_sem_map.sensor_log import Points, SensorLog
 from gnss_sem_map.voxels.hash_table import HashTable, room_in, slot_of

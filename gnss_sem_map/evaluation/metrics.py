@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import OTHER, LabelSet, taxonomy
+from gnss_sem_map.labels.roles import Role
 
 MOVING_IDS = range(252, 260)
 """SemanticKITTI raw ids of moving objects; the vehicles among them map to the class `vehicle`."""
@@ -137,9 +138,7 @@ def dynamic_counts(
         )
     ids = truth & 0xFFFF
     moving = np.isin(ids, list(MOVING_IDS))
-    names = tables.label_set.names
-    # a class set without vehicles: none is counted as one
-    vehicle = tables.truth[ids] == (names.index("vehicle") if "vehicle" in names else RAW_IDS)
+    vehicle = np.isin(tables.truth[ids], tables.label_set.having(Role.VEHICLE))
     row = np.where(moving, 0, np.where(vehicle, 1, 2))
     counted = np.where(moving, vehicle, ids > 1)  # 0 unlabelled, 1 outlier
     cells = 2 * row[counted] + (removed[counted] != 0)

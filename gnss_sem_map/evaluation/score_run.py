@@ -30,8 +30,8 @@ from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
-from gnss_sem_map.machine import threads
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
 
 """Largest stamp in s and length in m."""
 
@@ -73,14 +73,12 @@ def score_run(
 
 def _check_scorable(out: Path) -> None:
     """Raise DataError for a folder without labels of single points, which are needed for scoring."""
-    about = read_run(out)
-    if "merged" in about:
-        made_of = about["merged"] if isinstance(about["merged"], list) else [about["merged"]]
-        of_drives = f"evaluate {shown(out / DRIVES)}/NAME, made with --write-labels; NAME is one of"
-        instead = of_drives if is_folder(out / DRIVES) else "evaluate the runs that it was made of,"
+    read_run(out)
+    if is_folder(out / DRIVES):
+        names = " and ".join(sorted(path.name for path in (out / DRIVES).iterdir()))
         raise DataError(
-            f"{shown(out)}: a merged map has no labels of single points; {instead}"
-            f" {' and '.join(map(str, made_of))}"
+            f"{shown(out)}: a map of several drives has no labels of single points; evaluate"
+            f" {shown(out / DRIVES)}/NAME, made with --write-labels; NAME is one of {names}"
         )
     if not is_folder(out / "map"):
         raise DataError(

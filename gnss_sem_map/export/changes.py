@@ -18,13 +18,12 @@ from gnss_sem_map.export.longitudes import DEGREE_DIGITS, HEIGHT_DIGITS, near
 from gnss_sem_map.export.point_cloud import labelled_points, las_header, laz_writer
 from gnss_sem_map.files.atomic import link_or_copy, replacing
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.roles import MOVABLE
 
 CHANGES = "changes"
 GEOJSON, LAZ = f"{CHANGES}.geojson", f"{CHANGES}.laz"
 APPEARED, VANISHED = 1, 2
 """`user_data` of a voxel."""
-MOVES_BY_ITSELF = "vehicle"
-"""What is of this class was parked, not built."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +38,11 @@ class Change:
         """In words and numbers, for run.json, the report and the file."""
         thing = self.thing
         name = label_set.legend.names[thing.label] if thing.label >= 0 else "unknown"
+        was_parked = thing.label in label_set.having(*MOVABLE)
         return {
             "change": "appeared" if thing.appeared else "vanished",
             "class": name,
-            "kind": "parked" if name == MOVES_BY_ITSELF else "unknown" if thing.label < 0 else "built",
+            "kind": "parked" if was_parked else "unknown" if thing.label < 0 else "built",
             "before": self.before,
             "after": self.after,
             "centre_m": thing.centre.round(2).tolist(),

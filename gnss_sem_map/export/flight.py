@@ -15,8 +15,8 @@ from gnss_sem_map.export.exported import NO_VOXELS, Exported
 from gnss_sem_map.export.pictures import FIELD_OF_VIEW_DEG, colours_by_night, driven_m, lit_view
 from gnss_sem_map.export.render import Camera
 from gnss_sem_map.files.atomic import replacing
-from gnss_sem_map.machine import threads
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
 
 SIZE_PX = (640, 360)
 FRAME_MS = 80

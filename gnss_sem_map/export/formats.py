@@ -15,9 +15,9 @@ from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.thread_pools import thread_pool
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.run_stats import Progress, silent
+from gnss_sem_map.process.thread_pools import thread_pool
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ they did before. What stands on the ground is followed across tiles, and is fini
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.labels.roles import Role
 from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
@@ -33,7 +34,8 @@ SIMPLIFIED_M = 0.5
 OUTLINE_M = 0.3
 """Outlines differ by so much from those of the cells: Douglas and Peucker (1973)."""
 SHORTEST_KERB_M = 1.0
-GROUND = ("road", "sidewalk")
+GROUND = (Role.ROAD, Role.SIDEWALK)
+"""Layers of these names."""
 NOTHING, AROUND = 0, 255
 
 
@@ -82,20 +84,18 @@ class Feature:
 
 def features_of(tiled_map: TiledMap, georeference: Georeference) -> Iterator[Feature]:
     """All features of a map, read tile by tile; layers of classes that it has not stay empty."""
-    names, size = tiled_map.label_set.names, tiled_map.voxel_size_m
+    label_set, size = tiled_map.label_set, tiled_map.voxel_size_m
     standing = [
-        _Standing(layer, names.index(name), gap, size, fewest)
-        for layer, name, gap, fewest in (
-            ("buildings", "building", 3.0, 30),
-            ("vehicles", "vehicle", 1.5, 30),
-            ("poles", "pole", 1.5, 10),  # one of 2 m may be one column
+        _Standing(layer, label_set.having(role), gap, size, fewest)
+        for layer, role, gap, fewest in (
+            ("buildings", Role.BUILDING, 3.0, 30),
+            ("vehicles", Role.VEHICLE, 1.5, 30),
+            ("poles", Role.POLE, 1.5, 10),  # one of 2 m may be one column
         )
-        if name in names
     ]
-    ground = np.zeros(len(names) + 1, np.uint8)  # the last is of `other`, and of -1
-    for i, name in enumerate(GROUND, 1):
-        if name in names:
-            ground[names.index(name)] = i
+    ground = np.zeros(len(label_set.names) + 1, np.uint8)  # the last is of `other`, and of -1
+    for i, role in enumerate(GROUND, 1):
+        ground[label_set.having(role)] = i
     unread = set(tiled_map.tiles)
     for tile in tiled_map.tiles:
         piece = tiled_map.read_tile(tile)
@@ -131,15 +131,15 @@ def _ground(
         np.bincount(of_part, values.ravel()) / np.maximum(weights, 1) for values in (heights, confidence)
     )
     areas = {}
-    for i, name in enumerate(GROUND, 1):
+    for i, role in enumerate(GROUND, 1):
         rows = np.flatnonzero(kinds[numbers] == i)
-        areas[name] = shapes[rows], mean_confidence[numbers[rows]]
+        areas[role] = shapes[rows], mean_confidence[numbers[rows]]
         for row in rows:
             number = numbers[row]
             up = float(mean_height[number]) * size
             shape, [height] = _placed(shapes[row], [up], georeference)
-            yield Feature(name, shape, (shapes[row].area, height, float(mean_confidence[number])))
-    for line, sure in _kerbs(*areas["road"], *areas["sidewalk"]):
+            yield Feature(str(role), shape, (shapes[row].area, height, float(mean_confidence[number])))
+    for line, sure in _kerbs(*areas[Role.ROAD], *areas[Role.SIDEWALK]):
         placed, _ = _placed(line, [float(heights[seen].mean()) * size], georeference)
         yield Feature("kerbs", placed, (line.length, sure))
 
@@ -198,10 +198,10 @@ def _kerbs(
 
 @dataclass
 class _Standing:
-    """The objects of one class: the columns of those that a tile that is not read yet may go on with."""
+    """The objects of one role: the columns of those that a tile that is not read yet may go on with."""
 
     layer: str
-    label: int
+    labels: Sequence[int]
     gap_voxels: float
     voxel_size_m: float
     fewest_voxels: int
@@ -213,7 +213,7 @@ class _Standing:
 
     def finished(self, piece: SemanticMap, unread: set[Tile]) -> Iterator[tuple[NDArray[np.int64], Array]]:
         """Take in a tile; yield the columns of every object that no other tile can go on with."""
-        columns, confidence = _columns(piece, self.label)
+        columns, confidence = _columns(piece, self.labels)
         columns, confidence = (
             np.concatenate([self.open, columns]),
             np.concatenate([self.confidence, confidence]),
@@ -231,9 +231,9 @@ class _Standing:
                 yield columns[rows], confidence[rows]
 
 
-def _columns(piece: SemanticMap, label: int) -> tuple[NDArray[np.int64], Array]:
-    """The columns of a class in one tile."""
-    chosen = np.flatnonzero((piece.labels == label) & (piece.states != State.REMOVED))
+def _columns(piece: SemanticMap, labels: Sequence[int]) -> tuple[NDArray[np.int64], Array]:
+    """The columns of some classes in one tile."""
+    chosen = np.flatnonzero(np.isin(piece.labels, labels) & (piece.states != State.REMOVED))
     if not len(chosen):
         return np.empty((0, 5), np.int64), np.empty(0)
     indices = piece.voxels.indices[chosen].astype(np.int64)  # sorted by x, y, z

@@ -101,9 +101,7 @@ def claimed(
 
 
 @contextmanager
-def new_folder(
-    out: Path, by_name: Callable[[str], bool] = lambda name: False, all_content: bool = False
-) -> Iterator[Path]:
+def new_folder(out: Path, all_content: bool = False) -> Iterator[Path]:
     """A new folder for writing; it is renamed to `out` when the block succeeds, and removed when it fails.
 
     For `all_content` see `ownership.write_list`.
@@ -112,7 +110,7 @@ def new_folder(
     `claimed` does, when the disk is full, and when the old result can no longer be replaced: then it says where the
     new one is.
     """
-    with claimed(out, by_name=by_name) as claim:
+    with claimed(out) as claim:
         part = claim.work / work_folder.PART
         try:
             part.mkdir()

@@ -79,6 +79,12 @@ def is_whole(folder: Path) -> bool:
     return listed is not None and all(_is_as_listed(folder / name, states) for name, states in listed.items())
 
 
+def is_as_written(folder: Path, name: str) -> bool:
+    """Whether a file of a result folder, which may be in one of several drives, is as we wrote it."""
+    lists = ((inside, read_list(place) or {}) for place, inside in _with_lists(folder))
+    return any(_is_as_listed(folder / name, listed.get(inside + name, [])) for inside, listed in lists)
+
+
 def remove(folder: Path) -> None:
     """Remove our files from a folder, the list last, and then the folder; raises OSError.
 

@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.labels.roles import OF_ONE_CLASS, Role
 
 OTHER = "other"
 """Name of the class for everything that is none of the map's classes; in labels it is c, the number of these."""
 OTHER_COLOUR, OTHER_SEMANTIC_KITTI_ID, OTHER_ASPRS_CODE = (140, 130, 110), 99, 66
 """Of `other` in exports, as the classes have theirs; 99 is SemanticKITTI's other-object, 66 a user code of LAS."""
 
-SHIPPED_CLASS_SETS = ("urban",)
+SHIPPED_CLASS_SETS, ROLES = ("urban",), "roles"
 """The other files in `labels/` are taxonomies."""
 
 UNLABELLED = -1
@@ -63,6 +64,8 @@ class LabelSet:
     """(c,) LAS classification codes (LAS 1.4; 64 and above are user codes)."""
     sources: Mapping[str, Mapping[str, str]]
     """For every known taxonomy: its class name -> ours; absent names are `other`."""
+    given_roles: tuple[Role | None, ...] | None = None
+    """(c,) None: they are those of the names."""
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -77,6 +80,13 @@ class LabelSet:
                 f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one for every class,"
                 f" none of them 0, which is a point without a class, or {OTHER_SEMANTIC_KITTI_ID}, which is `other`"
             )
+        if len(self.roles) != count:
+            raise ConfigError(f"class set {self.name!r}: found {len(self.roles)} roles for {count} classes")
+        for role in OF_ONE_CLASS:
+            if len(those := [self.names[i] for i in self.having(role)]) > 1:
+                raise ConfigError(
+                    f"class set {self.name!r}: found the role {role} at {those}, expected it at one class at most"
+                )
         for source, table in self.sources.items():
             unknown = sorted(set(table.values()) - set(self.names))
             if unknown:
@@ -93,6 +103,32 @@ class LabelSet:
             np.vstack([self.colours, np.array(OTHER_COLOUR, np.uint8)]),
             np.append(self.semantic_kitti_ids, np.uint32(OTHER_SEMANTIC_KITTI_ID)),
             np.append(self.asprs_codes, np.uint8(OTHER_ASPRS_CODE)),
+        )
+
+    @cached_property
+    def roles(self) -> tuple[Role | None, ...]:
+        """(c,) role of every class."""
+        return roles_of_names(self.names) if self.given_roles is None else self.given_roles
+
+    def having(self, *roles: Role) -> list[int]:
+        """The classes with one of these roles, those of the first role first."""
+        return [label for role in roles for label, own in enumerate(self.roles) if own == role]
+
+    def the(self, role: Role) -> int | None:
+        """The first class with this role; None where none has it."""
+        return next(iter(self.having(role)), None)
+
+    @property
+    def said_of_roles(self) -> str:
+        """What is said of a class set that gives no roles; empty for one that does."""
+        if self.given_roles is not None:
+            return ""
+        count_as = (
+            f"{name} as {role or 'none of them'}" for name, role in zip(self.names, self.roles, strict=True)
+        )
+        return (
+            f"class set {self.name!r} gives no roles, and by their names its classes count so: {', '.join(count_as)};"
+            f" write `role:` at its classes, one of {', '.join(Role)} or null, to say it yourself"
         )
 
     def index(self, name: str) -> int:
@@ -113,7 +149,10 @@ class LabelSet:
             strict=True,
         )
         keys = ("name", "colour", "semantic_kitti_id", "asprs_code")
-        return {"name": self.name, "classes": [dict(zip(keys, row, strict=True)) for row in rows]}
+        classes = [dict(zip(keys, row, strict=True)) for row in rows]
+        if self.roles != roles_of_names(self.names):
+            classes = [known | {"role": role} for known, role in zip(classes, self.roles, strict=True)]
+        return {"name": self.name, "classes": classes}
 
     def table_from(self, source_names: Sequence[str]) -> NDArray[np.float32]:
         """The (s, c + 1) 0/1 matrix that sums the probabilities of s source classes into ours and, last, `other`.
@@ -230,14 +269,37 @@ def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> La
                 _word(s): {_word(theirs): _word(ours) for theirs, ours in table.items()}
                 for s, table in content.get("sources", {}).items()
             },
+            given_roles=_given_roles(content["name"], classes),
         )
     except ConfigError:
         raise
     except _CONTENT_ERRORS as error:
         raise ConfigError(
             f"class set {said}: {type(error).__name__} {str(error)[:200]};"
-            " expected name, classes (name, colour, semantic_kitti_id, asprs_code) and sources"
+            " expected name, classes (name, role, colour, semantic_kitti_id, asprs_code) and sources"
         ) from None
+
+
+def _given_roles(name: str, classes: Sequence[Mapping[str, Any]]) -> tuple[Role | None, ...] | None:
+    """The roles in a class set file; None where it gives none at all."""
+    said = [c.get("role") for c in classes]
+    if unknown := [role for role in said if role not in (None, *Role)]:
+        raise ConfigError(
+            f"class set {str(name)[:LONGEST_WORD]!r}: found the role {str(unknown[0])[:LONGEST_WORD]!r}, expected one"
+            f" of {[str(role) for role in Role]}, or null"
+        )
+    given = any("role" in c for c in classes)
+    return tuple(None if role is None else Role(role) for role in said) if given else None
+
+
+def roles_of_names(names: Sequence[str]) -> tuple[Role | None, ...]:
+    """The roles of classes of these names; of several for a role of one class, the first has it."""
+    known = {name: Role(role) for role, those in _read_shipped(ROLES).items() for name in those}
+    found: list[Role | None] = []
+    for name in names:
+        role = known.get(_plain(name))
+        found.append(None if role in OF_ONE_CLASS and role in found else role)
+    return tuple(found)
 
 
 def taxonomy(name_or_file: str | Path) -> Taxonomy:
@@ -313,7 +375,7 @@ def _shipped() -> list[str]:
 
 def shipped_taxonomies() -> list[str]:
     """Names of the taxonomies that ship with us."""
-    return [name for name in _shipped() if name not in SHIPPED_CLASS_SETS]
+    return [name for name in _shipped() if name not in (*SHIPPED_CLASS_SETS, ROLES)]
 
 
 def _read(name_or_file: str | Path, what: str, available: Sequence[str]) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""From a drive to a voxel map: trajectory, labelled scans, fusion in parallel with checkpoints, merging of maps."""
+"""From a drive to a voxel map: trajectory, labelled scans and fusion in parallel with checkpoints."""

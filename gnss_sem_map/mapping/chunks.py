@@ -29,9 +29,9 @@ from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, label_each_
 from gnss_sem_map.mapping.moving_points import observe_scan, range_images
 from gnss_sem_map.mapping.waiting_images import WaitingImages
 from gnss_sem_map.mapping.waiting_points import WaitingPoints
-from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.prefetch import prefetch
+from gnss_sem_map.process.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.sensor_log import Scan
 from gnss_sem_map.voxels.attribute_table import WAITS
 from gnss_sem_map.voxels.attributes import Attributes

@@ -32,9 +32,9 @@ from gnss_sem_map.geometric_classifier.training import Rows, rows_of
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.execution import Executor, InProcess, Task, path_of, run_tasks
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
-from gnss_sem_map.memory import release_memory
+from gnss_sem_map.process.execution import Executor, InProcess, Task, path_of, run_tasks
+from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.refinement import geometric_prior, height_above_ground, potts_mrf
 from gnss_sem_map.refinement.state import Evidence, GeometricEvidence
 from gnss_sem_map.voxels.attributes import NOTHING, Attributes, open_attributes

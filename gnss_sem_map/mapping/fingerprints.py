@@ -1,6 +1,7 @@
 """Digests of what decides a result: an interrupted run may be resumed where they are the same.
 
-A file stands in them with its size and its time of change, and the values that were read from small files as they are.
+A file stands in them with its size and its time of change, and the values that were read from small files as they are;
+poses of sensors to the nanometre, because their last digits depend on the type of the processor.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +93,8 @@ def _classes(drive: Drive) -> list[Any]:
 
 
 def _classes_of_map(label_set: LabelSet) -> list[Any]:
-    """The classes of the map, and which those of a network are; their file may be changed under its name."""
-    return [label_set.names, label_set.sources]
+    """The classes of the map, their roles, and which those of a network are; their file may be changed."""
+    return [label_set.names, label_set.sources, label_set.roles]
 
 
 def _scans(log: SensorLog) -> list[Any]:
@@ -112,9 +114,12 @@ def _cameras(log: SensorLog) -> list[Any]:
 
 
 def _calibration(log: SensorLog) -> Iterator[NDArray[Any]]:
-    yield from (one.calibration.T_imu_lidar for one in log.by_lidar)
+    """Of all LiDARs and cameras."""
+    poses = [one.calibration.T_imu_lidar for one in log.by_lidar]
     for camera in log.calibration.cameras:
-        yield from (camera.T_camera_lidar, camera.K, camera.lens)
+        poses.append(camera.T_camera_lidar)
+        yield from (camera.K, camera.lens)
+    yield from (pose.round(9) + 0.0 for pose in poses)  # + 0.0 makes -0.0 a 0.0
 
 
 def _state(item: Scan | Image) -> tuple[int, int] | None:
@@ -122,14 +127,33 @@ def _state(item: Scan | Image) -> tuple[int, int] | None:
     return None if path is None else _size_and_time(path)
 
 
-def _states(labels_from: str) -> list[tuple[str, tuple[int, int] | None]]:
-    """Sizes and times of the files that a segmenter's description names: label files, or those of a network."""
-    place = Path(labels_from.partition(":")[2].partition("?")[0])
-    if not labels_from.partition(":")[2] or not place.exists():
+def _states(labels_from: str) -> list[Any]:
+    """Of the files that a segmenter's description names, label files or those of a network, or of its code."""
+    kind, _, named = labels_from.partition("?")[0].partition(":")
+    if kind == "python":
+        return _contents_of_code(named.partition(".")[0].partition(":")[0])
+    place = Path(named)
+    if not named or not place.exists():
         return []
     folders = [place, *sorted(path for path in place.iterdir() if path.is_dir())] if place.is_dir() else []
     files = [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()] or [place]
     return [(str(path.relative_to(place)), _size_and_time(path)) for path in files]
+
+
+def _contents_of_code(package: str) -> list[tuple[str, str]]:
+    """Names and digests of the files of a top-level module or package, which is not imported.
+
+    Each machine of a cluster may have installed it at its own time, and place.
+    """
+    try:
+        found = find_spec(package)
+    except ValueError:  # no name of a module; who imports it says so
+        found = None
+    if found is None or found.origin is None:
+        return []
+    folder = Path(found.origin).parent
+    files = sorted(folder.rglob("*.py")) if found.submodule_search_locations else [Path(found.origin)]
+    return [(str(one.relative_to(folder)), hashlib.sha256(one.read_bytes()).hexdigest()) for one in files]
 
 
 def _size_and_time(path: Path) -> tuple[int, int] | None:

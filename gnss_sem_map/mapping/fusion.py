@@ -22,8 +22,8 @@ from gnss_sem_map.mapping.chunks import BLURRED, chunks_of, map_chunks
 from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
-from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.sensor_log import Skip
 
 GEOMETRY_ONLY = "the map shows geometry only"
@@ -111,6 +111,8 @@ def without_images(settings: Settings) -> str:
 
 
 def _warn(drive: Drive, stats: RunStats) -> None:
+    if said := drive.label_set.said_of_roles:
+        stats.warnings.append(said)
     if drive.log.images and not drive.log.cameras:
         stats.warnings.append(
             f"{drive.log.name}: no camera is described, so its {len(drive.log.images)} images are not used:"

@@ -22,11 +22,11 @@ from gnss_sem_map.dynamics.visibility import share_seen_through
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, open_label_set
 from gnss_sem_map.labels.probabilities import KeepsLabels
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.prefetch import prefetch
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
 from gnss_sem_map.scans.own_vehicle import reach_of_vehicle
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.projection import (
     ClassImage,
     View,

@@ -12,25 +12,26 @@ from gnss_sem_map.dynamics.observation import NearPoints, Observation, observe
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.visibility import THREADS, RangeImage
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels.label_set import OTHER
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.roles import MOVABLE
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, map_points
+from gnss_sem_map.process.prefetch import prefetch
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan
-
-MOVABLE = ("vehicle", "person", "pedestrian", "rider", "cyclist", "bicycle", "motorcycle")
-"""Classes of objects that may move, if the class set has them."""
 
 
 def movable_and_known(
-    shown: NDArray[np.int8], class_names: tuple[str, ...]
+    shown: NDArray[np.int8], label_set: LabelSet
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Masks of the points that the image labels as movable (n,), and of those that it labels at all (n,).
 
     `shown` (n,) as `LabelledScan.labels`. The class `other` may be a pole or a pedestrian, so it counts as unknown.
     """
-    is_movable = np.isin([*class_names, OTHER, ""], MOVABLE)  # the last one: not in an image
-    return is_movable.take(shown), (shown >= 0) & (shown < len(class_names))
+    count = len(label_set.names)
+    is_movable = np.isin(
+        np.arange(count + 2), label_set.having(*MOVABLE)
+    )  # the last one, -1: not in an image
+    return is_movable.take(shown), (shown >= 0) & (shown < count)
 
 
 def observe_scan(seen: LabelledScan) -> tuple[Observation, NearPoints]:
@@ -45,7 +46,7 @@ def observe_scan(seen: LabelledScan) -> tuple[Observation, NearPoints]:
         delays = SweepDelays.of(seen.points.xyz, stamps, seen.valid, T_map_lidar[:3, :3], scan.stamp)
     return observe(
         scan.number, scan.stamp, seen.p_map, T_map_lidar,
-        *movable_and_known(seen.labels, drive.label_set.names), drive.settings.dynamics, drive.image_rows, delays,
+        *movable_and_known(seen.labels, drive.label_set), drive.settings.dynamics, drive.image_rows, delays,
     )  # fmt: skip
 
 

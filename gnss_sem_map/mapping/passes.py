@@ -13,8 +13,8 @@ from factor_graphs.corrections import Correction
 from factor_graphs.errors import EstimationError
 from factor_graphs.sessions import Bound, bind, components
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.machine import one_blas_thread
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.machine import one_blas_thread
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.revisits import (
     Registrar,

@@ -8,18 +8,20 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
-from gnss_sem_map.machine import threads
+from gnss_sem_map.labels.roles import MOVABLE
 from gnss_sem_map.mapping.evidence import read_moving_points
 from gnss_sem_map.mapping.labelled_scans import Drive, map_points
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import TiledMap
@@ -29,6 +31,8 @@ SCANS_AT_ONCE = 300
 """The part of the map around so many scans is in memory at a time."""
 DRIVEN_IN_A_SWEEP_M = 60.0
 """Points may be this much farther from the pose of their scan than from that of their own stamp."""
+OF_ONE_OBJECT_M = 1.0
+"""Points that moved, and are as near as this, are of one object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +76,8 @@ def label_points(
     """For every usable scan, the labels of its original points by each of the maps, of which the last is refined.
 
     Two rules apply to the refined map only: the points in the files `moving_points` (see `mapping.evidence`) are
-    removed vehicles, whatever the class of their voxel; and the points in its `kerbs` are classified one by one as road
-    or sidewalk. Of the maps only the part around some scans is in memory. Raises DataError.
+    removed and of a class that may move, whatever that of their voxel; and the points in its `kerbs` are classified one
+    by one as road or sidewalk. Of the maps only the part around some scans is in memory. Raises DataError.
     """
     files = list(moving_points)
     moving: dict[int, NDArray[np.int64]] = {}
@@ -141,7 +145,8 @@ def _label_some(
                     f"frame {scan.number}: found {len(usable)} usable points, expected more than {moved.max()}, which"
                     " is said to have moved; was the scan changed? make the run again"
                 )
-            _remove(found[-1], usable[moved], maps[-1])
+            movable = drive.label_set.having(*MOVABLE)
+            _remove(found[-1], usable[moved], p_map[moved], movable)
         return found
 
     for scan, done in prefetch(label, scans, threads=threads()):
@@ -158,9 +163,20 @@ def _places(
     return places
 
 
-def _remove(found: PointLabels, points: NDArray[np.int64], semantic_map: SemanticMap) -> None:
-    names = semantic_map.voxels.label_set.names
-    if "vehicle" in names:
-        changed = points[found.labels[points] != names.index("vehicle")]
-        found.labels[changed], found.confidence[changed] = names.index("vehicle"), 0.5
+def _remove(
+    found: PointLabels, points: NDArray[np.int64], p_map: NDArray[np.float64], movable: Sequence[int]
+) -> None:
+    """Mark points, which are at `p_map` (m, 3) m, as removed, and call those of static voxels what may move.
+
+    They have the class of the nearest one of their object that lies in a voxel of what moved, or the first.
+    """
     found.removed[points] = True
+    is_known = np.isin(found.labels[points], movable)
+    if not movable or is_known.all():
+        return
+    classes = np.full(np.count_nonzero(~is_known), movable[0], np.int8)
+    if len(movable) > 1 and is_known.any():
+        away, nearest = KDTree(p_map[is_known]).query(p_map[~is_known])
+        classes = np.where(away <= OF_ONE_OBJECT_M, found.labels[points[is_known]][nearest], classes)
+    changed = points[~is_known]
+    found.labels[changed], found.confidence[changed] = classes, 1 / (len(movable) + 1)

@@ -17,9 +17,9 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.checkpoints import KEYFRAMES, MOVING_POINTS, REMOVED, STATIC, ChunkStore
 from gnss_sem_map.mapping.evidence import RunEvidence
-from gnss_sem_map.mapping.execution import Executor, InProcess, path_of
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles
-from gnss_sem_map.memory import release_memory
+from gnss_sem_map.process.execution import Executor, InProcess, path_of
+from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.voxels import attributes, tiles
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
 from gnss_sem_map.voxels.blocks import Block

@@ -30,10 +30,11 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.classifying import drives_of, geometric_evidence
-from gnss_sem_map.mapping.execution import Executor, InProcess, path_of
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
 from gnss_sem_map.mapping.tile_tasks import block_of, folder_of_tiles, make_tiles, on_blocks
-from gnss_sem_map.memory import release_memory
+from gnss_sem_map.process.execution import Executor, InProcess, path_of
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.refinement import crumbs, free_space, kerb_points
 from gnss_sem_map.refinement.by_block import (
     geometry_halo_m,
@@ -46,7 +47,6 @@ from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
-from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.blocks import Block, blocks_of, bounds_of, tiles_around
 from gnss_sem_map.voxels.map_json import files_of, name_of

@@ -10,7 +10,7 @@ from typing import Any
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import TILES
-from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
+from gnss_sem_map.process.execution import Executor, InProcess, Task, run_tasks
 from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.reuse import Made, of_work

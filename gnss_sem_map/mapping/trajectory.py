@@ -19,8 +19,8 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes, count_passes
-from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.process.memory import release_memory
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
 from gnss_sem_map.scans.local_maps import sweeps_along
 from gnss_sem_map.scans.revisits import Registrar
@@ -196,6 +196,17 @@ def check_georeference(log: SensorLog, origin: LocalFrame | None, voxel_size_m: 
             f" ({origin.lat_deg:.6f}, {origin.lon_deg:.6f}, {origin.alt_m:.1f} m) and {p_origin[2]:.0f} m above its"
             f" plane, expected less than {farthest_m / 1000:.0f} km and +-{highest_m:.0f} m; choose an --origin near"
             " the drive, or make two maps"
+        )
+
+
+def check_heights(name: str, trajectory: Trajectory, voxel_size_m: float) -> None:
+    """Raise DataError for a drive of this name that goes higher or lower than a map has voxels."""
+    up, highest_m = trajectory.positions[:, 2], voxel_size_m * Z_OFFSET
+    if len(up) and max(-up.min(), up.max()) >= highest_m:
+        raise DataError(
+            f"{name}: lies between {up.min():.0f} and {up.max():.0f} m over the origin of the map, expected less than"
+            f" +-{highest_m:.0f} m with voxels of {voxel_size_m:g} m; choose a larger mapping.voxel_size_m, or see to"
+            " the heights of the poses"
         )
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.memory import release_memory
+from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.refinement import (
     count_grid,
     geometric_prior,

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import gammaln
 
-from gnss_sem_map.machine import threads
+from gnss_sem_map.labels.roles import Role
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.thread_pools import thread_pool
 from gnss_sem_map.refinement.figures import FIXED_POINT, PSEUDO_COUNTS, Sums
 from gnss_sem_map.refinement.state import MapState, StepSettings, classes_of
-from gnss_sem_map.thread_pools import thread_pool
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
@@ -57,7 +58,7 @@ def reach_m(settings: CountGridSettings, voxel_size_m: float) -> float:
 def apply(state: MapState, settings: CountGridSettings) -> MapState:
     """Building against vegetation, column by column (eq. 8 to 11)."""
     voxels, scores, labels = state.voxels, state.scores, state.labels
-    first, second = classes_of(voxels.label_set, "building", "vegetation")
+    first, second = classes_of(voxels.label_set, Role.BUILDING, Role.VEGETATION)
     if settings.method == "paper":
         prior = state.figures.building_log_odds
         log_odds = paper_log_odds(voxels.keys, labels, (first, second), settings, prior)
@@ -74,7 +75,7 @@ def apply(state: MapState, settings: CountGridSettings) -> MapState:
 def measure(state: MapState, settings: CountGridSettings, own: NDArray[np.bool_]) -> Sums:
     """How often two voxels of one column disagree, at a map's `own` voxels (v,), and the number of either class."""
     labels = state.labels
-    first, second = classes_of(state.voxels.label_set, "building", "vegetation")
+    first, second = classes_of(state.voxels.label_set, Role.BUILDING, Role.VEGETATION)
     is_first, is_second = own & (labels == first), own & (labels == second)
     sums = Sums(buildings=int(is_first.sum()), vegetation=int(is_second.sum()))
     if settings.method == "paper":

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.roles import Role
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.state import MapState, StepSettings
 
@@ -64,15 +65,15 @@ def against(
     """
     steep, level = flatness < LEAST_FLATNESS, flatness > LEVEL
     rules = (
-        ("road", (heights > settings.road_highest_m) | steep, 1.0),
-        ("sidewalk", (heights > settings.sidewalk_highest_m) | steep, 1.0),
-        ("vehicle", heights > settings.vehicle_highest_m, 2.0),
-        ("building", heights < LEAST_HEIGHT_M, 1.0),
-        ("building", (heights < FOOT_M) & level, 1.0),
-        ("vegetation", heights < LEAST_HEIGHT_M, 0.5),
+        (Role.ROAD, (heights > settings.road_highest_m) | steep, 1.0),
+        (Role.SIDEWALK, (heights > settings.sidewalk_highest_m) | steep, 1.0),
+        (Role.VEHICLE, heights > settings.vehicle_highest_m, 2.0),
+        (Role.BUILDING, heights < LEAST_HEIGHT_M, 1.0),
+        (Role.BUILDING, (heights < FOOT_M) & level, 1.0),
+        (Role.VEGETATION, heights < LEAST_HEIGHT_M, 0.5),
     )
     result = np.zeros((len(heights), len(label_set.names)), np.float32)
-    for name, broken, weight in rules:
-        if name in label_set.names:
-            result[:, label_set.index(name)] -= np.float32(weight * settings.against_nat) * broken
+    for role, broken, weight in rules:
+        for label in label_set.having(role):
+            result[:, label] -= np.float32(weight * settings.against_nat) * broken
     return result

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.labels.roles import Role
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels import kernels
 from gnss_sem_map.voxels.kernels import AXIS_BITS
@@ -31,8 +32,8 @@ class RoadEdgeSettings(StepSettings):
 
 def road_and_sidewalk(label_set: LabelSet) -> tuple[int, int] | None:
     """Class indices of road and sidewalk; None for a class set that lacks one."""
-    names = label_set.names
-    return (names.index("road"), names.index("sidewalk")) if "road" in names and "sidewalk" in names else None
+    road, sidewalk = label_set.the(Role.ROAD), label_set.the(Role.SIDEWALK)
+    return None if road is None or sidewalk is None else (road, sidewalk)
 
 
 def with_odds(

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from gnss_sem_map.dynamics.motion_state import Motion
 from gnss_sem_map.dynamics.visibility import Keyframes
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.roles import Role
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.refinement.figures import Figures
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
@@ -213,8 +214,9 @@ class MapState:
         )
 
 
-def classes_of(label_set: LabelSet, *names: str) -> tuple[int, ...]:
-    """The classes of these names; raises NotApplicable where the set lacks one."""
-    if missing := [name for name in names if name not in label_set.names]:
-        raise NotApplicable(f"the class set has no {missing[0]}")
-    return tuple(label_set.index(name) for name in names)
+def classes_of(label_set: LabelSet, *roles: Role) -> tuple[int, ...]:
+    """The first class of each of these roles; raises NotApplicable where the set lacks one."""
+    found = {role: label_set.the(role) for role in roles}
+    if missing := [role for role, label in found.items() if label is None]:
+        raise NotApplicable(f"no class of the set has the role {missing[0]}")
+    return tuple(label for label in found.values() if label is not None)

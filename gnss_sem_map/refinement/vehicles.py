@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gnss_sem_map.dynamics.motion_state import Motion
+from gnss_sem_map.labels.roles import Role
 from gnss_sem_map.refinement.figures import Sums
 from gnss_sem_map.refinement.state import (
     MapState,
@@ -66,8 +67,12 @@ def reach_m(settings: VehicleSettings, voxel_size_m: float) -> float:
 
 def apply(state: MapState, settings: VehicleSettings) -> MapState:
     """Which voxels are vehicles, and, with `method: paper`, which of those moved (section 3.3.2)."""
-    voxels, labels = state.voxels, state.labels
-    vehicle, road = classes_of(voxels.label_set, "vehicle", "road")
+    voxels = state.voxels
+    vehicle, road = classes_of(voxels.label_set, Role.VEHICLE, Role.ROAD)
+    vehicles = voxels.label_set.having(Role.VEHICLE)
+    labels = np.where(
+        np.isin(state.labels, vehicles), np.int8(vehicle), state.labels
+    )  # one object may have several
     if settings.method == "paper":
         found = paper(voxels.indices, labels, vehicle, road, settings, voxels.voxel_size_m)
         return replace(state, removed=state.removed | found.moving | found.rejected, vehicles=found.objects)
@@ -75,13 +80,14 @@ def apply(state: MapState, settings: VehicleSettings) -> MapState:
         raise NotApplicable("the map has no road to stand on")
     found = supported(voxels.indices, labels, state.heights, vehicle, road, settings, voxels.voxel_size_m)
     scores = state.scores.copy()
-    scores[found.rejected, vehicle] -= np.float32(REJECTED_NAT)
+    for one in vehicles:
+        scores[found.rejected, one] -= np.float32(REJECTED_NAT)
     return replace(state, scores=scores, vehicles=found.objects)
 
 
 def measure(state: MapState, settings: VehicleSettings, own: NDArray[np.bool_]) -> Sums:
     """How many of a map's `own` voxels (v,) are road."""
-    (road,) = classes_of(state.voxels.label_set, "road")
+    (road,) = classes_of(state.voxels.label_set, Role.ROAD)
     return Sums(roads=int(np.count_nonzero(own & (state.labels == road))))
 
 

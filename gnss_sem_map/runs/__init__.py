@@ -1,1 +1,1 @@
-"""A run as a folder and as an object: written, read, refined, labelled and exported again, merged."""
+"""A run as a folder and as an object: written, read, refined, labelled and exported again."""

@@ -14,9 +14,9 @@ import numpy as np
 from factor_graphs.smoothing import Solution
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED
-from gnss_sem_map.pipeline import Mapped
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.refinement.steps import RefinementReport
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.pipeline import Mapped
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.voxels import tiles

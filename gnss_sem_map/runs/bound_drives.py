@@ -28,7 +28,7 @@ from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.sessions import components
-from gnss_sem_map import config, pipeline
+from gnss_sem_map import config
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import npz_of
@@ -36,10 +36,10 @@ from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, SWEEPS, TRAJECTORY, writing_to
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import failure_of
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
-from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.runs import run_folder
+from gnss_sem_map.process.execution import failure_of
+from gnss_sem_map.process.run_stats import RunStats
+from gnss_sem_map.runs import pipeline, run_folder
 from gnss_sem_map.runs.drive_job import read_job, read_trajectory, write_job
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.several_drives import SeveralDrives, refuse_earlier

@@ -15,7 +15,7 @@ from gnss_sem_map.files.run_json import inputs_of
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.sensor_model import CalibrationDrive, LabelCalibration
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.voxel_map import VoxelMap

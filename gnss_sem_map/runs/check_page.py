@@ -6,10 +6,10 @@ import os
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
 from gnss_sem_map.export.page import page as html_page
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.files.untrusted import open_file
+from gnss_sem_map.preflight.findings import Level, Preflight
 
 SUMMARIES = {
     Level.GREEN: "No check found a fault in this drive.",

@@ -11,10 +11,10 @@ from pathlib import Path
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints, fusion
 from gnss_sem_map.mapping.checkpoints import ChunkStore
-from gnss_sem_map.mapping.dask_cluster import Cluster
-from gnss_sem_map.mapping.execution import Task, path_of, run_tasks
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.process.dask_cluster import Cluster
+from gnss_sem_map.process.execution import Task, path_of, run_tasks
+from gnss_sem_map.process.worker_processes import Processes
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter

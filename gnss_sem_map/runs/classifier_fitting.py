@@ -13,7 +13,7 @@ from gnss_sem_map.geometric_classifier import classifier, training
 from gnss_sem_map.geometric_classifier.classifier import Classifier
 from gnss_sem_map.geometric_classifier.training import Rows
 from gnss_sem_map.mapping.classifying import drives_of
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.runs.finished_run import Run
 
 

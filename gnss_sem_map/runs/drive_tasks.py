@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map import config, pipeline
+from gnss_sem_map import config
 from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
 from gnss_sem_map.files.work_folder import DRIVES
-from gnss_sem_map.mapping.execution import failure_of
-from gnss_sem_map.runs import run_folder
+from gnss_sem_map.process.execution import failure_of
+from gnss_sem_map.runs import pipeline, run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, read_correction
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.same_run import digest_of, is_made_from

@@ -8,8 +8,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.mapping.dask_cluster import Cluster
-from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.process.dask_cluster import Cluster
+from gnss_sem_map.process.worker_processes import Processes
 
 LONGEST_TASK_S = 86_400.0
 """A worker that is busy with one drive, or a part of it, for longer is replaced."""

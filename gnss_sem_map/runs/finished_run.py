@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
@@ -44,13 +43,12 @@ from gnss_sem_map.mapping.classifying import OFF
 from gnss_sem_map.mapping.fusion import without_images
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
-from gnss_sem_map.run_stats import Progress, RunStats, silent
-from gnss_sem_map.runs import run_folder
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs import pipeline, run_folder
 from gnss_sem_map.runs.about import about_map, about_skips, with_objects
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
-from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.point_label_files import (
     LABELS,
     RAW_LABELS,
@@ -61,7 +59,8 @@ from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.run_settings import SETTINGS, differing, read_settings, write_settings
 from gnss_sem_map.runs.same_run import digest_of, is_run_of
 from gnss_sem_map.runs.source import Source, absolute, source_of
-from gnss_sem_map.runs.tracks import TRACKS, tracks_of
+from gnss_sem_map.runs.tracks import tracks_of
+from gnss_sem_map.runs.written_drives import write_summary
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.classes import unknown_classes
 from gnss_sem_map.sensor_log import SensorLog, Skip
@@ -133,18 +132,23 @@ def run(
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run in its folder, also a merged one; `Run.open(OUT)` checks it."""
+    """A finished run in its folder, of one drive or several; `Run.open(OUT)` checks it."""
 
     folder: Path
 
     @classmethod
     def open(cls, folder: Path | str) -> Run:
-        """Raises DataError for a folder that holds no finished map."""
+        """Raises DataError for a folder that holds no finished map, or one of the former command `merge`."""
         folder = Path(folder)
         restore(folder, run_folder.is_run_file)
-        read_run(folder)
+        about = read_run(folder)
         if not is_folder(folder / "refined"):
             raise DataError(f"{shown(folder)}: found no map in it; expected the -o of `gnss-sem-map run`")
+        if "merged" in about and not is_folder(folder / DRIVES):
+            raise DataError(
+                f"{shown(folder)}: was merged by a version before this one, and keeps no drives; map them together"
+                " with `gnss-sem-map run DRIVE DRIVE`"
+            )
         return cls(folder)
 
     @property
@@ -164,8 +168,8 @@ class Run:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of the IMU in the map, with covariances; raises DataError for a merged run."""
-        self._refuse_merged("trajectory", f"see {DRIVES}/NAME/trajectory.parquet in it")
+        """Poses of the IMU in the map, with covariances; raises DataError for a map of several drives."""
+        self._refuse_several("trajectory", f"see {DRIVES}/NAME/trajectory.parquet in it")
         return Trajectory.load(self.folder / "trajectory.parquet")
 
     @cached_property
@@ -201,7 +205,7 @@ class Run:
             georeference = run_folder.georeference_of(settings, run.frame)
             log = run.drive() if run._has_labels else None
             old_labels = shutil.ignore_patterns(*LABELS)
-            for name in (MAP, ATTRIBUTES, evidence.FOLDER, DRIVES, TRACKS):
+            for name in (MAP, ATTRIBUTES, evidence.FOLDER, DRIVES):
                 if is_folder(run.folder / name):
                     shutil.copytree(
                         run.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
@@ -222,7 +226,7 @@ class Run:
                     write_point_labels(folder, drives, refined.kerbs, settings, progress)
                 about = run.about | {"map": about_map(folder, refined.report)}
                 about |= {"warnings": list(dict.fromkeys([*warnings, *stats.warnings]))}
-                write_merged(folder, settings, about, progress)
+                write_summary(folder, settings, about, progress)
             else:
                 known = run.folder / RAW_LABELS
                 run_folder.write_again(
@@ -241,12 +245,12 @@ class Run:
     ) -> Run:
         """Map the drive again along the same trajectory with the labels of another segmenter.
 
-        Raises DataError for a merged run, and if the drive was moved or removed.
+        Raises DataError for a map of several drives, and if the drive was moved or removed.
         """
         spec = absolute(segmenter.replace("{drive}", str(self.about.get("drive"))))
         reads = run_folder.places_read([Source(inputs_of(self.folder).get("drive", ""), spec)])
         with self._rewritten(out, reads) as (folder, run):
-            run._refuse_merged(
+            run._refuse_several(
                 "relabelling", "map the drives again with `gnss-sem-map run` and the other --segmenter"
             )
             log = replace(run.drive(), frame=run.frame)  # --origin, or another drive, may have given it
@@ -346,13 +350,12 @@ class Run:
         """Whether it is a run of one drive with point labels."""
         return not self.is_merged and is_folder(self.folder / "labels")
 
-    def _refuse_merged(self, what: str, of_drives: str) -> None:
-        """`of_drives` is what to do instead where the map keeps its drives in folders of their own."""
-        instead = of_drives if is_folder(self.folder / DRIVES) else "use one of those"
+    def _refuse_several(self, what: str, instead: str) -> None:
+        """Raise DataError for a map of several drives; `instead` is what to do."""
         if self.is_merged:
             names = " and ".join(map(str, self.about["merged"]))
             raise DataError(
-                f"{shown(self.folder)}: is merged of {names}, expected a run of one drive for {what}; {instead}"
+                f"{shown(self.folder)}: is a map of {names}, expected a run of one drive for {what}; {instead}"
             )
 
     @contextmanager

@@ -30,10 +30,10 @@ from gnss_sem_map.files.output_folder import Claim, refuse_locked
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES, REMOVED
-from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.trajectory import check_georeference
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.execution import InProcess
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, KnownTrack, bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import failed_before, map_all, save_failed
@@ -330,10 +330,6 @@ def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:
     run_folder.georeference_of(settings, frame)
     if is_folder(out / DRIVES):
         return settings, frame, {path.name: path for path in sorted((out / DRIVES).iterdir())}
-    if "merged" in about:
-        raise DataError(
-            f"{shown(out)}: was merged by `merge` and keeps no drives; expected a map of `gnss-sem-map run`"
-        )
     name = about.get("drive")
     if not isinstance(name, str) or Path(name).name != name or name in ("", ".."):
         raise DataError(f"{shown(out / 'run.json')}: damaged (drive: found {name!r}, expected a name)")

@@ -22,7 +22,6 @@ import numpy as np
 
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
@@ -31,8 +30,9 @@ from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import MATCHES, SWEEPS
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.execution import Executor, Task, path_of, run_tasks
+from gnss_sem_map.process.run_stats import Progress, silent
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_section, sections_of

@@ -16,14 +16,14 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.files.untrusted import is_folder
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.machine import threads
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.point_labels import PointLabels, label_points
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.tiles import TiledMap

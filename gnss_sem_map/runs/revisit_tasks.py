@@ -19,7 +19,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.work_folder import REVISITS, SWEEPS
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
+from gnss_sem_map.process.execution import Executor, Task, path_of, run_tasks
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.local_maps import LocalMaps, sweeps_of

@@ -19,7 +19,6 @@ from factor_graphs.trajectory import Trajectory
 from factor_graphs.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.dynamics.movers import movers_of
-from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.dates import are_dates
 from gnss_sem_map.export.exported import Exported, sure_part
 from gnss_sem_map.export.formats import write_exports
@@ -39,11 +38,12 @@ from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
-from gnss_sem_map.mapping.moving_points import MOVABLE
+from gnss_sem_map.labels.roles import MOVABLE
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
-from gnss_sem_map.pipeline import Located, Mapped
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.preflight.findings import Preflight
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
+from gnss_sem_map.process.thread_pools import leaving_all
 from gnss_sem_map.runs.about import (
     about_map,
     about_mapped,
@@ -53,11 +53,11 @@ from gnss_sem_map.runs.about import (
     seconds_of,
     with_objects,
 )
+from gnss_sem_map.runs.pipeline import Located, Mapped
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_settings import COPIES, write_settings
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
-from gnss_sem_map.thread_pools import leaving_all
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import open_attributes
 
@@ -138,7 +138,8 @@ def write_drive(
 
 def write_objects(folder: Path, name: str, mapped: Mapped, settings: Settings) -> None:
     """Write what moved in a drive of this name."""
-    movable = [each for each in open_label_set(settings.classes).names if each in MOVABLE]
+    label_set = open_label_set(settings.classes)
+    movable = {label_set.names[label]: str(label_set.roles[label]) for label in label_set.having(*MOVABLE)}
     log = mapped.log
     write_movers(movers_of(mapped.objects, movable), DriveOfMovers(name, log.epoch_ns, log.frame), folder)
 

@@ -13,8 +13,8 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file
 from gnss_sem_map.files.work_folder import DRIVES
-from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
-from gnss_sem_map.run_stats import Progress
+from gnss_sem_map.process.execution import Executor, Task, path_of, run_tasks
+from gnss_sem_map.process.run_stats import Progress
 from gnss_sem_map.runs.source import Source
 
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.export.changes import write_changes
 from gnss_sem_map.export.georeference import Georeference
@@ -29,11 +28,12 @@ from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.bound_drives import BoundDrives
-from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
+from gnss_sem_map.runs.run_folder import write_about, write_map_files
 from gnss_sem_map.runs.run_settings import COPIES, SETTINGS
 from gnss_sem_map.runs.session_changes import changes_in
 from gnss_sem_map.runs.several_drives import SeveralDrives
@@ -86,7 +86,16 @@ def write_drives(
             "map": about_map(folder, refined.report),
         }
         about["warnings"] += stats.warnings
-        return write_merged(folder, settings, about, run.progress)
+        return write_summary(folder, settings, about, run.progress)
+
+
+def write_summary(
+    folder: Path, settings: Settings, about: dict[str, Any], progress: Progress = silent
+) -> dict[str, Any]:
+    """Write all files of a map of several drives beside its maps and drives, which are there; returns run.json."""
+    changes = about.get("changes", ())
+    write_map_files(folder, tracks_of(folder), str(about["name"]), settings.delivery, changes, progress)
+    return write_about(folder, settings, about, {})
 
 
 def _about_drives(

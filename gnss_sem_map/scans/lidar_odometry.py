@@ -29,11 +29,11 @@ from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.process.prefetch import prefetch
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.deskew import usable_points_at_stamp
 from gnss_sem_map.scans.downsampling import thinned
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.registration import DegenerateSettings
 from gnss_sem_map.scans.revisits import RevisitSettings
 from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps

@@ -94,12 +94,12 @@ def nearest(values: Array, wanted: Array) -> NDArray[np.intp]:
     return np.searchsorted(values, values[np.where(is_after, after, before)])
 
 
-def cloud_of(points: Array, neighbours: int = NEIGHBOURS) -> small_gicp.PointCloud:
+def cloud_of(points: Array) -> small_gicp.PointCloud:
     """Points (n, 3) m, each with the plane of its neighbours; empty where there are too few."""
-    if len(points) <= neighbours:
+    if len(points) <= NEIGHBOURS:
         return small_gicp.PointCloud(np.empty((0, 3)))
     cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
-    small_gicp.estimate_covariances(cloud, small_gicp.KdTree(cloud), neighbours)
+    small_gicp.estimate_covariances(cloud, small_gicp.KdTree(cloud), NEIGHBOURS)
     return cloud
 
 

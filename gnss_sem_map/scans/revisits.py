@@ -19,11 +19,11 @@ from pydantic import Field
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.sessions import AnchorPairs
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.machine import threads
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
 from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.local_maps import LocalMaps, normals, way_along
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.registration import DegenerateSettings
 from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
 

@@ -20,11 +20,11 @@ from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.output_folder import locked, real_path
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
-from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.process.prefetch import prefetch
+from gnss_sem_map.process.run_stats import Progress, silent
+from gnss_sem_map.process.thread_pools import leaving_all, unless_left
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
-from gnss_sem_map.thread_pools import leaving_all, unless_left
 
 ABOUT = "about.json"
 """File with the segmenter of a cache; frames of two segmenters are not mixed."""

@@ -14,12 +14,12 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
+from gnss_sem_map.process.thread_pools import unless_left
 from gnss_sem_map.scans.projection import class_image
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cache import write_probabilities
 from gnss_sem_map.segmentation.cached import read_probabilities
 from gnss_sem_map.sensor_log import Image
-from gnss_sem_map.thread_pools import unless_left
 
 ABOUT = "about.json"
 

@@ -15,7 +15,7 @@ from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from gnss_sem_map.errors import ConfigError, DataError, errors_of_others
-from gnss_sem_map.memory import reuse_memory
+from gnss_sem_map.process.memory import reuse_memory
 from gnss_sem_map.segmentation.classes import VOID
 from gnss_sem_map.segmentation.pixels import checked_pixels, named, scaled
 from gnss_sem_map.sensor_log import Image

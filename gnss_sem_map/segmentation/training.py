@@ -25,9 +25,9 @@ from torch.nn.functional import cross_entropy, interpolate
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.ownership import MARKER, write_list
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.machine import threads
-from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.prefetch import prefetch
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.segmentation.checkpoints import (
     LOAD_ERRORS,
     load_strictly,

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.machine import threads
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.thread_pools import thread_pool
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Singles, kernel
 from gnss_sem_map.simulation.noise import value_noise
-from gnss_sem_map.thread_pools import thread_pool
 
 CLASS_NAMES: Final = ("road", "sidewalk", "vehicle", "building", "vegetation", "other")
 _ROAD, _SIDEWALK, _VEHICLE, _BUILDING, _VEGETATION, _OTHER = range(6)

@@ -15,7 +15,8 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import locked
 from gnss_sem_map.files.ownership import MARKER, read_list, write_list
-from gnss_sem_map.machine import threads
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.thread_pools import thread_pool
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.jam import drive_through_jam
@@ -37,7 +38,6 @@ from gnss_sem_map.simulation.truth import (
     write_vehicles,
 )
 from gnss_sem_map.simulation.world import World
-from gnss_sem_map.thread_pools import thread_pool
 
 SECONDS = 30.0  # of a drive, when nothing else is said
 _OTHER_SENSOR = 20_011  # apart in the numbers of the noise: a drive of 2000 s has as many frames

@@ -11,11 +11,11 @@ import numpy as np
 
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS
 from gnss_sem_map.datasets import kitti_raw
-from gnss_sem_map.machine import threads
+from gnss_sem_map.process.machine import threads
+from gnss_sem_map.process.thread_pools import thread_pool
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.drive import Simulation, refuse_there, write_truth
 from gnss_sem_map.simulation.png_files import write_ids, write_photo
-from gnss_sem_map.thread_pools import thread_pool
 
 Progress = Callable[[int, int], None]
 

@@ -31,8 +31,9 @@ HEIGHT_UNITS = 256
 """Heights of points are measured from the bottom of their voxel in this part of its edge: 0.8 mm at 0.2 m."""
 UNITS_PER_NAT = 1024
 """Log-likelihoods are sums of round(1024 ln p): exact, with a resolution far below the errors of any network."""
-EVIDENCE_LIMIT = 1 << 30
-"""No sum may fall below minus this: 200,000 observations of one voxel at the floor of 1 %."""
+SUM_LIMIT = 1 << 30
+"""A sum stays at minus or plus this once it is there: 200,000 observations of one voxel at the floor of 1 %, before a
+vehicle that stands for some minutes. The terms of a sum have one sign, so it depends on no order, also at the limit."""
 HITS_LIMIT = (1 << 31) - 1
 """Most points of one voxel."""
 PREFETCH_AHEAD = 16
@@ -99,6 +100,12 @@ def unpack_keys(keys, indices):
         indices[i, 2] = (keys[i] & AXIS_MASK) - AXIS_OFFSET
 
 
+@njit(cache=True, nogil=True, inline="always")
+def limited(total):
+    """A sum within SUM_LIMIT."""
+    return min(max(total, -SUM_LIMIT), SUM_LIMIT)
+
+
 @njit(cache=True, nogil=True)
 def fuse(
     rows, ints, bytes_, slots, count, start, keys, pixels, heights, observations, levels, moments_us, sums
@@ -108,7 +115,7 @@ def fuse(
     `pixels[i]` is the row of `observations` (p, k) of point i, or -1 without a pixel; `sums` are its columns, as a
     tuple, so that their number is known at compile time; `heights` (n,) are those of the points in 1 / HEIGHT_UNITS of
     a voxel's edge. Attributes are noted if there are `levels` and `moments_us` (n,). Returns the number of voxels and
-    the first point that is not added yet, or -1 - i for a point i whose voxel overflows.
+    the first point that is not added yet, or -1 - i for a point i whose voxel has HITS_LIMIT.
     """
     hits, room = FIRST_SUM + len(sums), room_in(rows, slots)
     names, size = rows[:, 0], len(slots)
@@ -136,12 +143,9 @@ def fuse(
         if len(levels) > 0:
             note(rows, ints, bytes_, row, levels, moments_us, first, end)
         while next_observed < len(observed) and observed[next_observed] < end:
-            pixel, lowest = pixels[observed[next_observed]], int64(0)
+            pixel = pixels[observed[next_observed]]
             for c in range(len(sums)):
-                ints[row, FIRST_SUM + c] += observations[pixel, c]
-                lowest = min(lowest, int64(ints[row, FIRST_SUM + c]))
-            if lowest < -EVIDENCE_LIMIT:
-                return count, -1 - observed[next_observed]
+                ints[row, FIRST_SUM + c] = limited(int64(ints[row, FIRST_SUM + c]) + observations[pixel, c])
             next_observed += 1
     return count, len(keys)
 
@@ -220,7 +224,7 @@ def merge(
     keys_a, evidence_a, of_images_a, hits_a, heights_a, keys_b, evidence_b, of_images_b, hits_b, heights_b,
     keys, evidence, of_images, hits, heights,
 ):  # fmt: skip
-    """Add two maps, both sorted by key; returns the number of voxels of the result, or -1 on overflow."""
+    """Add two maps, both sorted by key; returns the number of voxels of the result, or -1 where one has HITS_LIMIT."""
     a, b, to = 0, 0, 0
     while a < len(keys_a) or b < len(keys_b):
         from_a = b == len(keys_b) or (a < len(keys_a) and keys_a[a] <= keys_b[b])
@@ -232,14 +236,11 @@ def merge(
         hits[to] = total
         heights[to] = (heights_a[a] if from_a else int64(0)) + (heights_b[b] if from_b else int64(0))
         for c in range(evidence.shape[1]):
-            nats = (int64(evidence_a[a, c]) if from_a else int64(0)) + (
-                int64(evidence_b[b, c]) if from_b else int64(0)
-            )
-            if nats < -EVIDENCE_LIMIT:
-                return -1
-            evidence[to, c] = nats
+            of_a, of_b = evidence_a[a, c] if from_a else 0, evidence_b[b, c] if from_b else 0
+            evidence[to, c] = limited(int64(of_a) + of_b)
         for c in range(of_images.shape[1]):
-            of_images[to, c] = (of_images_a[a, c] if from_a else 0) + (of_images_b[b, c] if from_b else 0)
+            of_a, of_b = of_images_a[a, c] if from_a else 0, of_images_b[b, c] if from_b else 0
+            of_images[to, c] = limited(int64(of_a) + of_b)
         a, b, to = a + from_a, b + from_b, to + 1
     return to
 

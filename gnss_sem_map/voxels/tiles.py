@@ -21,7 +21,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.atomic import link_or_copy, unfinished
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
-from gnss_sem_map.memory import release_memory
+from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.voxels import tile_files
 from gnss_sem_map.voxels.blocks import Block, bounds_of, tiles_around
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, OF_IMAGES

@@ -19,7 +19,7 @@ from pathlib import Path
 
 PRELOAD = [
     "gnss_sem_map.cli.commands",
-    "gnss_sem_map.pipeline",
+    "gnss_sem_map.runs.pipeline",
     "gnss_sem_map.runs.run_folder",
     "gnss_sem_map.datasets.kitti_raw",
     "gnss_sem_map.datasets.kitti_odometry",

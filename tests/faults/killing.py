@@ -94,7 +94,7 @@ def write_run_like(out: Path, files: Mapping[str, str]) -> None:
 def map_street(drive: Path, probabilities: Path, work: Path) -> None:
     """Map a drive in chunks of four scans into a work folder, going on with what is there."""
     from gnss_sem_map.mapping.fusion import map_scans
-    from gnss_sem_map.run_stats import RunStats
+    from gnss_sem_map.process.run_stats import RunStats
 
     map_scans(street_drive(drive, probabilities), work, RunStats(), resume=True)
 

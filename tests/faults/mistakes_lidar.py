@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
-from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.preflight.sample import Sample
 from gnss_sem_map.scans.deskew import usable_points_at_stamp
 
 

@@ -22,11 +22,11 @@ from faults.damage import SWEEPS, Harm, Place, damage
 from faults.harness import gnss_sem_map
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_folder import about_run
 from gnss_sem_map.segmentation import Segmenter

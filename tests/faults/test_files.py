@@ -268,12 +268,11 @@ def test_names_that_are_no_text_can_be_said(drives, trial, tmp_path: Path) -> No
         trial("names")
 
 
-@pytest.mark.parametrize("command", ["trajectory", "check", "evaluate", "run", "calibrate", "merge"])
+@pytest.mark.parametrize("command", ["trajectory", "check", "evaluate", "run", "calibrate"])
 def test_odd_names_on_the_command_line_are_answered_in_one_line(command: str, trial, tmp_path: Path) -> None:
     rest = {
         "evaluate": ["--truth", "x"],
         "calibrate": ["--truth", "x"],
-        "merge": ["b", "-o", "out"],
         "check": [],
     }
     for name in (os.fsdecode(b"\xff\xfe"), "x" * 300, "/" + "y/" * 3000, "a\tb\nc", ""):

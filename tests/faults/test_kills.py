@@ -26,7 +26,7 @@ from street import Street
 from gnss_sem_map.files.ownership import MARKER, is_partial
 from gnss_sem_map.mapping.checkpoints import REMOVED, STATIC
 from gnss_sem_map.mapping.fusion import map_scans
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 
 OLD = {
     "run.json": "{}",

@@ -14,13 +14,13 @@ from faults import mistakes_camera, mistakes_inertial, mistakes_lidar
 from faults.layouts import as_odometry, as_table_log, copy_of
 from faults.mistakes import Mistake
 
-from gnss_sem_map import config, pipeline
+from gnss_sem_map import config, preflight
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.evaluation import preflight
-from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.preflight.findings import Level, Preflight
+from gnss_sem_map.process.run_stats import RunStats
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import Camera, simulate, write_corrupted_labels
 

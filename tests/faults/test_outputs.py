@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -47,7 +46,7 @@ FOREIGN: dict[str, Callable[[Path], None]] = {
 @pytest.mark.parametrize("listed", [True, False])
 @pytest.mark.parametrize(
     "command",
-    ["trajectory", *(pytest.param(name, marks=pytest.mark.faults) for name in ("run", "merge", "demo"))],
+    ["trajectory", *(pytest.param(name, marks=pytest.mark.faults) for name in ("run", "demo"))],
 )
 def test_a_result_with_something_foreign_in_it_is_refused_before_any_work(
     small_drive: Street, name: str, listed: bool, command: str, trial, tmp_path: Path
@@ -59,13 +58,8 @@ def test_a_result_with_something_foreign_in_it_is_refused_before_any_work(
     words = {
         "trajectory": ("trajectory", small_drive.drive),
         "run": ("run", small_drive.drive, "--segmenter", f"labels:{small_drive.labels}"),
-        "merge": ("merge", small_drive.drive, small_drive.labels),
         "demo": ("demo", "--seconds", "3"),
     }[command]
-    if command == "merge":
-        for number, folder in enumerate(("a", "b")):
-            write_result(tmp_path / folder, {**RUN, "run.json": json.dumps({"number": number})})
-        words = ("merge", tmp_path / "a", tmp_path / "b")
     outcome = gnss_sem_map(*words, "-o", out, folder=tmp_path / "trial")
     trial("foreign files in OUT", refused(outcome, before, out.parent, name.rstrip("/")), outcome)
 
@@ -222,10 +216,7 @@ def test_of_two_commands_the_second_is_refused_and_told_by_whom(small_drive, tri
             "-o",
             place / "out",
         ),
-        "merge": ("merge", tmp_path / "a", tmp_path / "b", "-o", place / "out"),
     }
-    for number, folder in enumerate("ab"):
-        write_result(tmp_path / folder, {**RUN, "run.json": json.dumps({"number": number})})
     with (place / ".out.lock").open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         for name, words in commands.items():

@@ -16,7 +16,8 @@ from faults.harness import gnss_sem_map
 from gnss_sem_map import config
 from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.evaluation.score_run import score_run
-from gnss_sem_map.mapping.merging import merge_runs
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.runs.calibrating import calibrate
 from gnss_sem_map.voxels import tiles
 
@@ -92,11 +93,6 @@ FILES = [
 def _damaged(out: Path, name: str, damage: Callable[[Path], None], folder: Path) -> Path:
     copy = folder / "out"
     shutil.copytree(out, copy)
-    about = json.loads((copy / "run.json").read_text())
-    about["scans_s"] = [
-        stamp + 1000 for stamp in about["scans_s"]
-    ]  # else it holds the same drive, for `merge`
-    (copy / "run.json").write_text(json.dumps(about))
     path = min((copy / name).parent.glob("*.parquet")) if name.endswith("TILE") else copy / name
     damage(path)
     return copy
@@ -112,7 +108,7 @@ def test_a_damaged_run_gives_our_own_errors(name, damage, made, trial, tmp_path:
         lambda: score_run(copy, truth),
         lambda: config.load(copy / "config.yaml"),
         lambda: tiles.read(copy / "map"),
-        lambda: merge_runs(out, copy),
+        lambda: open_raw(copy, open_label_set()).fused.whole(),
     ):
         try:
             read()
@@ -130,7 +126,7 @@ def test_a_command_says_in_one_line_that_a_run_is_damaged(name, damage, made, tr
     copy = _damaged(out, name, damage, tmp_path)
     for number, words in enumerate((
         ("evaluate", copy, "--truth", truth),
-        ("merge", out, copy, "-o", tmp_path / "merged"),
+        ("refine", copy, "-o", tmp_path / "again"),
         ("calibrate", copy, "--truth", truth, "-o", tmp_path / "calibration.yaml"),
     )):  # fmt: skip
         outcome = gnss_sem_map(*words, folder=tmp_path / f"process{number}")

@@ -16,8 +16,8 @@ from street import Street
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.fusion import map_scans
-from gnss_sem_map.mapping.worker_processes import Processes
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
+from gnss_sem_map.process.worker_processes import Processes
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.source import source_of
 

@@ -25,7 +25,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping import passes
 from gnss_sem_map.mapping.trajectory import locate
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.runs import bound_drives, finished_run, many_drives, run_folder
 from gnss_sem_map.runs.bound_drives import KnownTrack, groups_of
 from gnss_sem_map.runs.finished_run import Run

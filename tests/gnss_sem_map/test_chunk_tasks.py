@@ -15,12 +15,12 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.checkpoints import ChunkStore
-from gnss_sem_map.mapping.dask_cluster import Cluster
-from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.mapping.worker_processes import Processes
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.dask_cluster import Cluster
+from gnss_sem_map.process.execution import InProcess
+from gnss_sem_map.process.run_stats import RunStats
+from gnss_sem_map.process.worker_processes import Processes
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks, map_range
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter

@@ -20,7 +20,7 @@ from gnss_sem_map.cli import app
 from gnss_sem_map.cli.console import print_preflight, print_run
 from gnss_sem_map.datasets import readers
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.evaluation.preflight.findings import Preflight
+from gnss_sem_map.preflight.findings import Preflight
 from gnss_sem_map.runs import expected_cost
 from gnss_sem_map.sensor_log import Skip
 

@@ -16,21 +16,25 @@ import numpy as np
 import pyogrio
 import pytest
 from street import Street
+from typer.testing import CliRunner
 
-from gnss_sem_map import Run, Settings, pipeline
+from gnss_sem_map import Run, Settings
+from gnss_sem_map.cli import app
 from gnss_sem_map.cli.options import delivered_in
 from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.output_folder import locked, new_folder
-from gnss_sem_map.files.ownership import MARKER
+from gnss_sem_map.files.ownership import MARKER, amend
+from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.labels.roles import Role
 from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings
-from gnss_sem_map.runs import calibrating, finished_run, merged_run
+from gnss_sem_map.runs import calibrating, finished_run, pipeline
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.classifier_fitting import fit_classifier
-from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import State
@@ -285,13 +289,12 @@ def replaced(out: Path, **files: str) -> None:
             (folder / f"{name}.yaml").write_text(text)
 
 
-@pytest.mark.parametrize("command", ["refine", "relabel", "merge", "export", "calibrate"])
+@pytest.mark.parametrize("command", ["refine", "relabel", "export", "calibrate"])
 def test_a_run_that_another_command_replaces_while_it_is_read_is_no_source(
-    command: str, merged: Run, small_drive: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, finished: Run, small_drive: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else the map of one run and the trajectory of another would be written as one, without a word."""
-    whole, to = merged.folder.parent, tmp_path / "to"
-    out, other = Run.open(shutil.copytree(whole / "a", tmp_path / "out")), whole / "b"
+    out, to = Run.open(shutil.copytree(finished.folder, tmp_path / "out")), tmp_path / "to"
     times = []
 
     def another(*_: object) -> None:
@@ -301,12 +304,11 @@ def test_a_run_that_another_command_replaces_while_it_is_read_is_no_source(
     def beside(original: Callable[..., object]) -> Callable[..., object]:
         return lambda *words, **named: (another(), original(*words, **named))[1]
 
-    for module, name in ((pipeline, "refine"), (merged_run, "refine_map"), (calibrating, "open_segmenter")):
+    for module, name in ((pipeline, "refine"), (calibrating, "open_segmenter")):
         monkeypatch.setattr(module, name, beside(getattr(module, name)))
     commands: dict[str, Callable[[], object]] = {
         "refine": lambda: out.refine(out.settings, to),
         "relabel": lambda: out.relabel(f"labels:{small_drive.labels}", to),
-        "merge": lambda: merged_run.merge_run_folders(other, out.folder, to, match=False),
         "export": lambda: out.export(["ply", "laz"], to, progress=another),
         "calibrate": lambda: calibrating.calibrate([(out.folder, small_drive.labels)]),
     }
@@ -328,39 +330,6 @@ def test_a_run_is_refined_as_it_is_and_not_as_it_was_when_it_was_opened(
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no run folder"):
         Run.open(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def merged(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    folder = tmp_path_factory.mktemp("merged")
-    for name, frames in (("a", "0:6"), ("b", "6:12")):
-        run(small_drive.drive, folder / name, f"labels:{small_drive.labels}", frames=frames, force=True)
-    merge_run_folders(folder / "a", folder / "b", folder / "merged", match=False)
-    return Run.open(folder / "merged")
-
-
-def test_a_merged_run_is_read_refined_and_exported(merged: Run, tmp_path: Path) -> None:
-    whole = merged.map()
-    low, high = whole.voxels.centres.min(axis=0), whole.voxels.centres.mean(axis=0)
-    assert 0 < len(merged.map((low, high))) < len(whole)
-    again = merged.refine(merged.settings, tmp_path / "again")
-    assert again.is_merged
-    assert files(again.folder) == files(merged.folder)
-    assert again.about == merged.about
-    other = with_refinement(merged.settings, potts_mrf={"enabled": False})
-    changed = again.refine(other)
-    assert changed.settings == other
-    assert files(changed.folder / "map") == files(merged.folder / "map")
-    assert files(changed.folder / "refined") != files(merged.folder / "refined")
-    [ply] = merged.export(["ply"], tmp_path / "files")
-    assert ply.read_bytes() == (merged.folder / "map.ply").read_bytes()
-
-
-def test_a_merged_run_has_no_trajectory_and_cannot_be_relabelled(merged: Run, small_drive: Street) -> None:
-    with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for trajectory"):
-        _ = merged.trajectory
-    with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for relabelling"):
-        merged.relabel(f"labels:{small_drive.labels}")
 
 
 def test_points_of_other_have_its_id_and_run_json_counts_its_voxels(finished: Run, tmp_path: Path) -> None:
@@ -466,3 +435,87 @@ def test_the_coordinates_of_all_files_change_together_and_the_map_stays(
     assert len(laspy.read(copc).points) == len(laspy.read(again.folder / "map.laz").points)
     with pytest.raises(ConfigError, match=r"EPSG:27700 is for"):
         finished.refine(finished.settings.changed("delivery.crs=27700"), tmp_path / "elsewhere")
+
+
+def test_an_error_of_the_report_is_blamed_on_run_json_only_where_somebody_changed_it(
+    small_drive: Street, finished: Run, tmp_path: Path
+) -> None:
+    out = shutil.copytree(finished.folder, tmp_path / "out")
+    truth = tmp_path / "truth"
+    shutil.copytree(out / "labels", truth)
+    wrong = json.dumps(read_run(out) | {"warnings": 5}).encode()
+    amend(out, "run.json", wrong)  # as if we had written it so
+    words = ["evaluate", str(out), "--truth", str(truth)]
+    assert isinstance(CliRunner().invoke(app, words).exception, TypeError)
+    (out / "run.json").write_bytes(wrong + b" ")
+    with pytest.raises(DataError, match=r"run.json: damaged \(TypeError"):
+        CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def class_set(file: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> str:
+    """A file of the five classes and their roles, each changed."""
+    urban = open_label_set()
+    rows = [row | {"role": role} for row, role in zip(urban.about()["classes"], urban.roles, strict=True)]
+    sources = {"labels": {row["name"]: change(row)["name"] for row in rows}}
+    file.write_text(json.dumps({"name": "mine", "classes": [*map(change, rows)], "sources": sources}))
+    return str(file)
+
+
+def test_roles_decide_and_names_of_classes_mean_nothing(
+    small_drive: Street, finished: Run, tmp_path: Path
+) -> None:
+    file = class_set(tmp_path / "mine.yaml", lambda row: row | {"name": row["name"][::-1]})
+    settings = finished.settings.changed(f"classes={file}")
+    out = run(
+        small_drive.drive,
+        tmp_path / "out",
+        f"labels:{small_drive.labels}",
+        settings,
+        write_labels=True,
+        force=True,
+    )
+    assert out.label_set.names == tuple(name[::-1] for name in finished.label_set.names)
+    for refined in (False, True):
+        here, there = out.map(refined=refined), finished.map(refined=refined)
+        for name in ("labels", "confidence", "states"):
+            np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+        for name in ("keys", "evidence", "hits"):
+            np.testing.assert_array_equal(getattr(here.voxels, name), getattr(there.voxels, name))
+    for folder in ("labels", "removed", "confidence"):
+        for path in (finished.folder / folder).iterdir():
+            assert (out.folder / folder / path.name).read_bytes() == path.read_bytes()
+    layers = [pyogrio.list_layers(one.folder / "map.gpkg").tolist() for one in (finished, out)]
+    assert layers[0] == layers[1]
+    for layer, _ in layers[0]:
+        known = [
+            pyogrio.read_info(one.folder / "map.gpkg", layer=layer)["features"] for one in (finished, out)
+        ]
+        assert known[0] == known[1], layer
+
+
+def test_points_that_moved_through_what_stands_are_of_the_class_of_their_object(
+    small_drive: Street, finished: Run, tmp_path: Path
+) -> None:
+    """Compared point by point with all others; the building walks here."""
+    file = class_set(
+        tmp_path / "mine.yaml",
+        lambda row: row | {"role": {"building": "person"}.get(row["name"], row["role"])},
+    )
+    settings, log = finished.settings.changed(f"classes={file}"), finished.drive().between("3:4")
+    maps = [tiles.in_memory(finished.map())]
+    write_moving_points({3: np.arange(0, 6000, 3)}, tmp_path / "moved.npz")
+    [(_, [before])] = label_points(log, finished.trajectory, maps, settings)
+    [(_, [found])] = label_points(log, finished.trajectory, maps, settings, [tmp_path / "moved.npz"])
+    points = np.flatnonzero(found.removed)
+    was, p_map = before.labels[points], small_drive.p_map[3][points]
+    stays = np.isin(was, finished.label_set.having(Role.VEHICLE, Role.BUILDING))
+    assert 100 < np.count_nonzero(stays) < len(points) - 100
+    np.testing.assert_array_equal(found.labels[points[stays]], was[stays])
+    np.testing.assert_array_equal(found.confidence[points[stays]], before.confidence[points[stays]])
+    away = np.linalg.norm(p_map[~stays, None] - p_map[None, stays], axis=2)
+    nearest, changed = away.min(axis=1), found.labels[points[~stays]]
+    is_sure = (np.abs(nearest - 1) > 0.1) & (np.sort(away, axis=1)[:, 1] > nearest + 0.05)
+    expected = np.where(nearest < 1, was[stays][away.argmin(axis=1)], finished.label_set.index("vehicle"))
+    np.testing.assert_array_equal(changed[is_sure], expected[is_sure])
+    assert len(np.unique(changed[is_sure])) == 2
+    np.testing.assert_allclose(found.confidence[points[~stays]], 1 / 3)

@@ -19,7 +19,7 @@ from gnss_sem_map import Run, Settings, open_drive, run
 from gnss_sem_map.datasets.given_trajectory import read_tum
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.trajectory import locate
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
 
 pytestmark = pytest.mark.integration

@@ -15,10 +15,10 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.map_sharpness import SweepSample, of_sample
 from gnss_sem_map.files.work_folder import SWEEPS, clear
-from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.mapping.worker_processes import Processes
-from gnss_sem_map.run_stats import silent
+from gnss_sem_map.process.execution import Executor, InProcess
+from gnss_sem_map.process.run_stats import silent
+from gnss_sem_map.process.worker_processes import Processes
 from gnss_sem_map.runs import match_tasks
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.source import Source

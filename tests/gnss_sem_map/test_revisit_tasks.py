@@ -15,8 +15,8 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import clear
-from gnss_sem_map.mapping.execution import Executor, InProcess
-from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.process.execution import Executor, InProcess
+from gnss_sem_map.process.worker_processes import Processes
 from gnss_sem_map.runs import revisit_tasks
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.source import Source

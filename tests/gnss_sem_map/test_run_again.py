@@ -1,8 +1,7 @@
-"""From the command line: a run that is killed and resumed, shared by processes, or merged with another."""
+"""From the command line: a run that is killed and resumed, or shared by processes."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 from commands import gnss_sem_map
 from street import Street
@@ -219,33 +217,3 @@ def test_a_resumed_run_asks_the_network_for_no_image_twice(
     asked = died.asked + resumed.asked
     assert len(asked) == len(set(asked)) == len(small_drive.frames)
     assert results_of(out) == results_of(live)
-
-
-def test_two_halves_of_a_drive_merge_into_the_whole(small_drive: Street, whole: Path, tmp_path: Path) -> None:
-    """The halves have one frame and one trajectory, so every voxel, hit and look of the whole comes back exactly.
-
-    What moved, and LiDAR odometry, are found from all scans of a run: half a drive knows less, so they are off.
-    """
-    off = (
-        "--set",
-        "dynamics.enabled=false",
-        "--set",
-        "refinement.vehicles.enabled=false",
-        "--set",
-        "trajectory.lidar_odometry=false",
-    )
-    for name, frames in (("a", "0:6"), ("b", "6:12"), ("both", "0:12")):
-        done = gnss_sem_map(*run_of(small_drive, tmp_path / name, "--frames", frames, *off))
-        assert done.returncode == 0, done.stderr
-    done = gnss_sem_map(
-        "merge", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "merged", "--no-match", "--json"
-    )
-    assert done.returncode == 0, done.stderr
-    both, merged = (tiles.read(tmp_path / name / "map").voxels for name in ("both", "merged"))
-    for name in ("keys", "evidence", "hits"):
-        np.testing.assert_array_equal(getattr(merged, name), getattr(both, name))
-    assert json.loads(done.stdout)["map"]["voxels"] == len(both)
-    assert (tmp_path / "merged/map.laz").is_file()
-    done = gnss_sem_map("merge", tmp_path / "a", small_drive.labels, "-o", tmp_path / "no")
-    assert done.returncode == 1
-    assert "no run folder here" in done.stderr

@@ -53,7 +53,7 @@ def tracked(track, motion=Motion.MOVING, lidar="", chunk=0):
 
 
 def only(track):
-    (mover,) = movers_of([tracked(track)], ("vehicle",))
+    (mover,) = movers_of([tracked(track)], {"vehicle": "vehicle"})
     return mover
 
 
@@ -120,13 +120,15 @@ def test_what_stands_is_not_listed() -> None:
     for aside in (3.0, 6.0, 12.0):
         parked = segments(lambda t: (0.0, 0.0), straight, lambda t, y=aside: (-18.0 + 9.0 * t, y))
         for motion in Motion:
-            assert not movers_of([tracked(track_of(parked), motion)], ("vehicle",))
+            assert not movers_of([tracked(track_of(parked), motion)], {"vehicle": "vehicle"})
 
 
 def test_what_moves_but_is_not_judged_to_is_not_listed() -> None:
     track = track_of(segments(passing, straight, still))
-    assert not movers_of([tracked(track, Motion.PARKED), tracked(track, Motion.UNKNOWN)], ("vehicle",))
-    assert not movers_of([tracked(None)], ("vehicle",))
+    assert not movers_of(
+        [tracked(track, Motion.PARKED), tracked(track, Motion.UNKNOWN)], {"vehicle": "vehicle"}
+    )
+    assert not movers_of([tracked(None)], {"vehicle": "vehicle"})
 
 
 def part(track, rows):
@@ -139,7 +141,7 @@ def part(track, rows):
 def test_tracks_of_two_chunks_are_one_object_and_each_scan_counts_once() -> None:
     whole = track_of(segments(passing, straight, still))
     first, second = part(whole, slice(0, 28)), part(whole, slice(15, None))
-    (mover,) = movers_of([tracked(first, chunk=0), tracked(second, chunk=1)], ("vehicle",))
+    (mover,) = movers_of([tracked(first, chunk=0), tracked(second, chunk=1)], {"vehicle": "vehicle"})
     np.testing.assert_array_equal(mover.stamps, whole.stamps)
     np.testing.assert_allclose(mover.speeds, only(whole).speeds)
     assert mover.points == whole.points.sum()
@@ -163,7 +165,7 @@ def test_a_part_of_a_car_that_was_a_segment_of_its_own_is_no_object(chunk) -> No
         return replace(car, positions=car.positions + off, size_m=(0.4, 0.6, 0.5), points=np.full(40, 3))
 
     def count(other):
-        return len(movers_of([tracked(car), tracked(part(other, slice(9, 21)), chunk=chunk)], ()))
+        return len(movers_of([tracked(car), tracked(part(other, slice(9, 21)), chunk=chunk)], {}))
 
     assert count(small(-LENGTH / 2)) == 1
     assert count(small(LENGTH / 2, WIDTH / 3)) == 1
@@ -186,7 +188,7 @@ def test_what_follows_a_lorry_closer_than_a_car_could_is_a_part_of_it(behind_m, 
     car = track_of(segments(lambda t: (SPEED * t, 9.0), straight, still))
     lorry = replace(car, size_m=(0.3, 2.2, 2.4), points=car.points + 100, labelled=0.0)
     other = replace(car, size_m=size_m, positions=car.positions - (behind_m, 0.0, 0.0), labelled=0.0)
-    movers = movers_of([tracked(lorry), tracked(other)], ("vehicle",))
+    movers = movers_of([tracked(lorry), tracked(other)], {"vehicle": "vehicle"})
     assert len(movers) == count
     assert movers[-1].name == "vehicle"
 
@@ -196,7 +198,7 @@ def test_two_lidars_that_see_one_car_list_it_once() -> None:
     right = track_of(segments(passing, straight, lambda t: (1.0, 9.0)))
     ahead = np.array([0.05 * SPEED, 0.0, 0.0])
     right = replace(right, stamps=right.stamps + 0.05, positions=right.positions + ahead)
-    (mover,) = movers_of([tracked(left, lidar="left"), tracked(right, lidar="right")], ("vehicle",))
+    (mover,) = movers_of([tracked(left, lidar="left"), tracked(right, lidar="right")], {"vehicle": "vehicle"})
     assert mover.lidars == ("left", "right")
     assert len(mover.stamps) == 80
     np.testing.assert_allclose(mover.speeds, SPEED, atol=0.3)
@@ -205,9 +207,9 @@ def test_two_lidars_that_see_one_car_list_it_once() -> None:
 def test_two_cars_of_one_chunk_stay_two_and_so_do_those_of_two_chunks_behind_each_other() -> None:
     one = track_of(segments(passing, straight, still))
     behind = replace(one, positions=one.positions - (6.0, 0.0, 0.0))
-    assert len(movers_of([tracked(one), tracked(behind)], ())) == 2
-    assert len(movers_of([tracked(one), tracked(behind, chunk=1)], ())) == 2
-    assert len(movers_of([tracked(one), tracked(replace(one, positions=one.positions + 0.3))], ())) == 2
+    assert len(movers_of([tracked(one), tracked(behind)], {})) == 2
+    assert len(movers_of([tracked(one), tracked(behind, chunk=1)], {})) == 2
+    assert len(movers_of([tracked(one), tracked(replace(one, positions=one.positions + 0.3))], {})) == 2
 
 
 @pytest.mark.parametrize(
@@ -222,7 +224,7 @@ def test_class_by_shape(size_m, speed_mps, name) -> None:
 
 def test_labels_tell_the_class_only_where_one_class_moves() -> None:
     track = track_of(segments(passing, straight, still))
-    assert movers_of([tracked(track)], ("vehicle",))[0].is_labelled
+    assert movers_of([tracked(track)], {"vehicle": "vehicle"})[0].is_labelled
     both = movers_of([tracked(track)], ("person", "vehicle"))[0]
     assert (both.is_labelled, both.name) == (False, "vehicle")
     assert both.labelled == pytest.approx(0.5, abs=0.02)

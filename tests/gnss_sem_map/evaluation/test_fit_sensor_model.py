@@ -25,7 +25,7 @@ from gnss_sem_map.evaluation.fit_sensor_model import fit_temperature, measure
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration, read
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.runs.calibrating import calibrate, drive_and_map
 from gnss_sem_map.runs.run_settings import write_settings
 from gnss_sem_map.segmentation import Segmenter, open_segmenter

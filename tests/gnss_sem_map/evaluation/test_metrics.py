@@ -180,7 +180,11 @@ def test_a_class_set_without_vehicles_has_no_moving_ones() -> None:
     names = tuple(name for name in URBAN.names if name != "vehicle")
     kept = {source: name for source, name in URBAN.sources["semantic_kitti"].items() if name in names}
     still = replace(
-        URBAN, names=names, semantic_kitti_ids=ids(40, 48, 50, 70), sources={"semantic_kitti": kept}
+        URBAN,
+        names=names,
+        given_roles=None,
+        semantic_kitti_ids=ids(40, 48, 50, 70),
+        sources={"semantic_kitti": kept},
     )
     found = dynamic(dynamic_counts(ids(1, 1, 0), ids(252, 10, 40), Tables.of(still), "here"))
     assert (found["DA"], found["SA"], found["SA_vehicle"], found["moving_points"]) == (None, 1 / 2, None, 0)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.errors import ConfigError
-from gnss_sem_map.labels.label_set import OTHER, open_label_set, taxonomy
+from gnss_sem_map.labels.label_set import OTHER, LabelSet, open_label_set, taxonomy
+from gnss_sem_map.labels.roles import Role
 
 URBAN = open_label_set()
 
@@ -142,3 +143,43 @@ def test_ids_of_semantic_kitti_map_as_the_scoring_protocol_says() -> None:
     }
     assert {i: int(table[i]) for i in expected} == expected
     assert np.isin(table[[44, 72, 51, 80, 30, 16]], [5]).all()
+
+
+def with_roles(**roles: str | None) -> LabelSet:
+    rows = [
+        {"name": name, "colour": [1, 2, 3], "semantic_kitti_id": 40 + i, "asprs_code": 11}
+        for i, name in enumerate(roles)
+    ]
+    return open_label_set(
+        {
+            "name": "mine",
+            "classes": [
+                row | ({} if role == "" else {"role": role})
+                for row, role in zip(rows, roles.values(), strict=True)
+            ],
+        }
+    )
+
+
+def test_roles_are_those_of_the_file_and_where_it_gives_none_those_of_the_names() -> None:
+    by_name = with_roles(Car="", other_vehicle="", lawn="", road="", street="")
+    assert by_name.roles == (Role.VEHICLE, Role.VEHICLE, None, Role.ROAD, None)
+    assert "Car as vehicle" in by_name.said_of_roles
+    given = with_roles(Car=None, strasse="road", amoeba="person", snail="")
+    assert given.roles == (None, Role.ROAD, Role.PERSON, None)
+    assert (given.the(Role.ROAD), given.the(Role.POLE), given.having(Role.VEHICLE, Role.PERSON)) == (
+        1,
+        None,
+        [2],
+    )
+    assert given.said_of_roles == URBAN.said_of_roles == ""
+    for known in (by_name, given, URBAN):
+        assert open_label_set(known.about()).roles == known.roles
+
+
+def test_roles_that_are_none_and_those_of_two_classes_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"found the role 'rode', expected one of .*'road'"):
+        with_roles(road="rode", sidewalk="sidewalk")
+    with pytest.raises(ConfigError, match=r"the role road at \['road', 'bridge'\]"):
+        with_roles(road="road", bridge="road")
+    assert with_roles(car="vehicle", bus="vehicle").having(Role.VEHICLE) == [0, 1]

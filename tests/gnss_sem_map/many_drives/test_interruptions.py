@@ -24,16 +24,15 @@ from maps_of_drives import SETTINGS, assert_same, mapped, products, run_of
 from street_drives import Drives
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.files.ownership import CONTENT_BYTES, write_list
-from gnss_sem_map.mapping.execution import Task, path_of
-from gnss_sem_map.mapping.worker_processes import Processes
-from gnss_sem_map.runs import finished_run, many_drives, run_folder
+from gnss_sem_map.process.execution import Task, path_of
+from gnss_sem_map.process.worker_processes import Processes
+from gnss_sem_map.runs import finished_run, many_drives, pipeline, run_folder
 from gnss_sem_map.runs.drive_tasks import map_one
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.runs.source import source_of

@@ -21,8 +21,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files import ownership
 from gnss_sem_map.files.run_json import read_run
-from gnss_sem_map.mapping.merging import merge_runs
-from gnss_sem_map.runs import finished_run, merged_run
+from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.voxels import tiles
@@ -124,22 +123,28 @@ def test_the_drives_of_a_map_have_its_settings_also_when_it_is_refined_with_othe
     assert_same(out, made["ab"])
 
 
+def test_a_map_of_many_drives_has_no_trajectory_and_cannot_be_relabelled(made: dict[str, Path]) -> None:
+    for asked in (lambda run: run.trajectory, lambda run: run.relabel("none")):
+        with pytest.raises(DataError, match="ab: is a map of a and b, expected a run of one drive"):
+            asked(Run.open(made["ab"]))
+
+
+def test_what_merge_of_an_earlier_version_left_is_refused_with_what_to_do(
+    made: dict[str, Path], tmp_path: Path
+) -> None:
+    """Such a folder has one map of two runs, and no drives."""
+    out = shutil.copytree(made["a"], tmp_path / "out")
+    (out / "run.json").write_text(json.dumps(read_run(out) | {"merged": ["a", "b"]}))
+    with pytest.raises(DataError, match="gnss-sem-map run DRIVE DRIVE"):
+        Run.open(out)
+
+
 def test_only_a_drive_that_is_there_is_taken_out(made: dict[str, Path]) -> None:
     for name in ("z", "../a", "", "a/map"):
         with pytest.raises(DataError, match=rf"ab: holds no drive '{name}'; expected one of a, b$"):
             remove_drive(made["ab"], name)
     with pytest.raises(DataError, match=r"a: a is its only drive; remove the folder instead$"):
         remove_drive(made["a"], "a")
-
-
-def test_a_map_of_many_drives_is_merged_with_all_its_keyframe_scans(made: dict[str, Path]) -> None:
-    merged = merge_runs(made["ab"], made["a"], match=False)
-    keyframes = "evidence/keyframes/0.npz"
-    assert [path for path, _ in merged.keyframes] == [
-        made["ab"] / "drives/a" / keyframes,
-        made["ab"] / "drives/b" / keyframes,
-        made["a"] / keyframes,
-    ]
 
 
 def labels_of(drive: Path) -> dict[str, bytes]:
@@ -184,48 +189,6 @@ def test_what_only_a_run_of_one_drive_can_do_is_refused_with_what_works(
     says = f"evaluate {place}/NAME, made with --write-labels; NAME is one of a and b$"
     with pytest.raises(DataError, match=says):
         score_run(made["ab"], drives.by_name["a"])
-
-
-def test_a_map_of_many_drives_is_merged_into_a_run_with_their_tracks(
-    made: dict[str, Path], tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    merged_run.merge_run_folders(made["ab"], made["abc"] / "drives" / "c", out, match=False)
-    assert len(list((out / "tracks").iterdir())) == 2
-    again = Run(out).refine(Run(out).settings, tmp_path / "again")
-    assert again.about["merged"] == ["ab", "c"]
-    assert [drive["drive"] for drive in again.about["made_of"]] == ["a", "b", "c"]
-
-
-def test_no_drive_is_merged_twice(made: dict[str, Path], tmp_path: Path) -> None:
-    """Neither out of maps of several drives, nor of a merged map, nor of a copy of the drive elsewhere."""
-    c, merged, copied = made["abc"] / "drives" / "c", tmp_path / "merged", tmp_path / "copied"
-    merged_run.merge_run_folders(made["a"], c, merged, match=False)
-    shutil.copytree(made["a"], copied)
-    about = read_run(copied)
-    about["inputs"]["drive"] = "/elsewhere/a"
-    (copied / "run.json").write_text(json.dumps(about))
-    for first, second in ((made["ab"], made["a"]), (made["a"], made["ab"]), (merged, c), (made["a"], copied)):
-        with pytest.raises(
-            DataError, match=f"{second.name}: the drive [ac] is in .*{first.name} too, and all evid"
-        ):
-            merged_run.merge_run_folders(first, second, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    about["scans_s"][1] += 1.0  # another drive in a folder of this name
-    (copied / "run.json").write_text(json.dumps(about))
-    merged_run.merge_run_folders(made["a"], copied, tmp_path / "out", match=False)
-
-
-def test_to_a_merged_map_no_drive_is_added(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    merged_run.merge_run_folders(made["a"], made["abc"] / "drives" / "c", out, match=False)
-    says = r"out: was merged by `merge` and keeps no drives; expected a map of `gnss-sem-map run`$"
-    with pytest.raises(DataError, match=says):
-        add_drive(out, drives.by_name["b"], how)
-    with pytest.raises(DataError, match=says):
-        remove_drive(out, "a")
 
 
 @pytest.mark.parametrize("name", ["../../outside", "..", "", "/outside", None, 3])

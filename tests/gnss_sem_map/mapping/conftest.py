@@ -10,7 +10,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 
 NOTHING_MOVES = Settings.model_validate({"dynamics": {"enabled": False}})

@@ -30,7 +30,7 @@ from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import MOVING_POINTS, REMOVED, STATIC, ChunkStore
 from gnss_sem_map.mapping.fusion import map_range, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 
@@ -73,7 +73,7 @@ MAP = """
 import sys
 from pathlib import Path
 from gnss_sem_map.mapping import fusion
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels.label_set import open_label_set
@@ -261,6 +261,41 @@ def test_an_input_that_was_changed_since_is_noticed(
         before = fingerprints.of_map(copied, labels_from)
 
 
+def test_code_of_a_segmenter_that_was_edited_is_noticed(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In its module, or in another one of its package; a copy of it elsewhere is the same code."""
+    monkeypatch.syspath_prepend(tmp_path)
+    package = tmp_path / "looks_package"
+    package.mkdir()
+    for file in (
+        tmp_path / "looks_alone.py",
+        package / "__init__.py",
+        package / "network.py",
+        package / "layers.py",
+    ):
+        file.write_text("factor = 1\n")
+    for spec, file in (
+        ("looks_alone:see", "looks_alone.py"),
+        ("looks_package.network:see", "looks_package/layers.py"),
+    ):
+        before = fingerprints.of_map(drive, f"python:{spec}?classes=road")
+        (tmp_path / file).touch()
+        assert fingerprints.of_map(drive, f"python:{spec}?classes=road") == before
+        (tmp_path / file).write_text("factor = 2\n")
+        assert fingerprints.of_map(drive, f"python:{spec}?classes=road") != before
+
+
+def test_the_last_digits_of_a_pose_are_no_other_drive(drive: Drive) -> None:
+    """They depend on the processor that multiplied the matrices of the calibration."""
+    calibration, before = drive.log.calibration, fingerprints.of_map(drive, "")
+    for off, is_same in ((1e-15, True), (1e-6, False)):
+        T_imu_lidar = calibration.T_imu_lidar.copy()
+        T_imu_lidar[:3, 3] += off
+        log = replace(drive.log, calibration=replace(calibration, T_imu_lidar=T_imu_lidar))
+        assert (fingerprints.of_map(replace(drive, log=log), "") == before) == is_same
+
+
 def test_classes_that_were_changed_in_their_file_are_noticed(drive: Drive, tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     shutil.copyfile(Path(fingerprints.__file__).parents[1] / "labels/urban.yaml", file)
@@ -299,7 +334,7 @@ from gnss_sem_map.errors import DataError
 from test_tiles import random_map, FRAME
 from gnss_sem_map.mapping import checkpoints
 from gnss_sem_map.mapping.chunks import MappedChunk
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import NOTHING
 from gnss_sem_map.labels.label_set import open_label_set

@@ -21,7 +21,7 @@ from gnss_sem_map.mapping.evidence import read_moving_points
 from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.sensor_log import Points
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 

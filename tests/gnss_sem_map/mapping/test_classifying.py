@@ -23,11 +23,10 @@ from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import classifying, refining
 from gnss_sem_map.mapping.classifying import FILE, DriveClassifier
-from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import open_raw
-from gnss_sem_map.run_stats import silent
+from gnss_sem_map.process.execution import InProcess
+from gnss_sem_map.process.run_stats import silent
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
-from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.voxels import blocks
 from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
@@ -268,7 +267,7 @@ def test_a_classifier_that_does_not_fit_is_refused_before_the_work(
     of = replace(of, names=("road", "lawn", *of.names[2:])) if wrong == "classes" else of
     file.write_bytes(b"no" if wrong == "bytes" else of.to_bytes())
     settings = Settings().changed(f"geometric_classifier.model={file}")
-    monkeypatch.setattr("gnss_sem_map.pipeline.locate", None)
+    monkeypatch.setattr("gnss_sem_map.runs.pipeline.locate", None)
     with pytest.raises(DataError, match=r"model\.npz: (is of|cannot be used)") as refused:
         run(small_drive.drive, tmp_path / "out", f"labels:{small_drive.labels}", settings, force=True)
     assert "\n" not in str(refused.value)
@@ -381,15 +380,3 @@ def test_runs_without_labels_teach_nothing(street_run: Run, tmp_path: Path) -> N
         "fit-classifier: images label nothing; give runs that were made with --segmenter"
     )
     assert not (tmp_path / "new.npz").exists()
-
-
-@pytest.mark.slow
-def test_a_merged_run_has_a_classifier_of_its_own_and_is_the_same_when_refined_again(
-    both: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "merged"
-    merge_run_folders(both / "drives/a", both / "drives/b", out, match=False)
-    merged = Run.open(out)
-    assert inferred(merged.map()).sum() > 1000
-    again = merged.refine(merged.settings, tmp_path / "again")
-    assert refined(again.folder) == refined(out)

@@ -19,7 +19,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.labelled_scans import Drive, label_each_scan, labelled_scans
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.scans.projection import class_image, image_exposed_at
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter

@@ -20,13 +20,13 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.evaluation.preflight import camera
-from gnss_sem_map.evaluation.preflight.findings import Level
-from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.preflight import camera
+from gnss_sem_map.preflight.findings import Level
+from gnss_sem_map.preflight.sample import Sample
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabilities_folder

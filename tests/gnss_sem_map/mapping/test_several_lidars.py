@@ -26,7 +26,7 @@ from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import Lidar, Scan, SensorLog
 from gnss_sem_map.voxels.voxel_map import VoxelMap

@@ -19,11 +19,11 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import TILES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import refining, tile_tasks
-from gnss_sem_map.mapping.execution import InProcess, Task
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
 from gnss_sem_map.mapping.tile_tasks import on_blocks
-from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.process.execution import InProcess, Task
+from gnss_sem_map.process.worker_processes import Processes
 from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.tile_files import Tile
 

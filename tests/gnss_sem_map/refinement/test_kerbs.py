@@ -12,7 +12,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import logit
 from scipy.stats import norm
 
-from gnss_sem_map import config, pipeline
+from gnss_sem_map import config
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.label_files import read_labels
 from gnss_sem_map.evaluation.metrics import Tables, confusion
@@ -22,6 +22,7 @@ from gnss_sem_map.mapping.point_labels import PointLabels, label_points
 from gnss_sem_map.refinement import kerb_points
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.kerbs import KerbSettings, find_kerbs
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
 from gnss_sem_map.voxels import tiles

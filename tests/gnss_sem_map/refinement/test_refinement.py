@@ -183,8 +183,8 @@ def test_a_class_set_without_buildings_skips_that_step_and_says_so(tmp_path):
     refined, report = refine(voxel_map(grid, [0, 1], names=open_label_set(file)))
     assert refined.labels.tolist() == [0, 1]
     skipped = {step.name: step.skipped for step in report.steps}
-    assert skipped["count_grid"] == "the class set has no building"
-    assert skipped["vehicles"] == "the class set has no vehicle"
+    assert skipped["count_grid"] == "no class of the set has the role building"
+    assert skipped["vehicles"] == "no class of the set has the role vehicle"
 
 
 def test_an_unknown_setting_is_refused():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -89,3 +91,18 @@ def test_the_stated_confidence_is_the_share_that_is_right() -> None:
         share = (true == VEHICLE)[group].mean()
         assert found.confidence[group].mean() == pytest.approx(share, abs=0.01)
         assert group.sum() > 1000
+
+
+def test_what_moved_has_the_class_that_images_say_if_that_may_move_and_else_the_first_that_may() -> None:
+    roles = {"car": "vehicle", "house": "building", "walker": "person", "road": "road", "tree": "vegetation"}
+    rows = [
+        {"name": name, "role": role, "colour": [0, 0, 0], "semantic_kitti_id": 40 + i, "asprs_code": 1}
+        for i, (name, role) in enumerate(roles.items())
+    ]
+    several = open_label_set({"name": "several", "classes": rows})
+    moved = replace(movers([0, 2, 2, 1, UNSEEN]), label_set=several)
+    refined, _ = refine(VoxelTable(0.2, several).to_map(), beside=Evidence(moved=moved))
+    assert refined.labels.tolist() == [0, 2, 2, 0, 0]
+    expected = probabilities_of(moved, 0.25)  # one of the four that images show
+    np.testing.assert_allclose(refined.confidence, expected[range(5), refined.labels], atol=STEP)
+    np.testing.assert_allclose(expected[-1], [0.375, 0.25 / 3, 0.375, 0.25 / 3, 0.25 / 3], atol=1e-5)

@@ -9,9 +9,9 @@ import pytest
 import street
 from faults.killing import content
 
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.runs import pipeline
 from gnss_sem_map.sensor_log import Image
 
 

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from factor_graphs.chi_square import BEYOND_DOUBT
-from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import AntennaHeadings
-from factor_graphs.model import from_values
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.side_measurements import FEWEST_SEEN, HUBER, Observed, Placed, noise_scale, placed
 
@@ -39,9 +37,7 @@ def observe_headings(headings: AntennaHeadings, problem: Problem, fit: Fit) -> O
     """What a solution by the fixes shows of headings, their stamps on the clock of the IMU."""
     place = placed(problem, headings.stamps)
     kept = headings[place.rows]
-    T = from_values(fit.values, len(problem.intervals.keyframes))[0]
-    covariances, _ = keyframe_covariances(fit.graph, fit.values, len(T))
-    own = stddevs_of_heading(T[:, :3, :3], covariances)[place.at]
+    own = stddevs_of_heading(fit.states[0][:, :3, :3], fit.covariances)[place.at]
     off = wrapped(kept.azimuths - _azimuths(problem, fit, place, kept.baseline))
     sure = own < (0.0 if problem.heading_in_doubt else SURE_HEADING)
     said = f"antenna heading: {len(kept)} of {len(headings)} used"
@@ -101,7 +97,7 @@ def _mistake(headings: AntennaHeadings, off: Array, own: Array) -> str:
 
 def _azimuths(problem: Problem, fit: Fit, place: Placed, baseline: Array) -> Array:
     """Azimuth (r,) rad of the baseline that a solution says."""
-    T = from_values(fit.values, len(problem.intervals.keyframes))[0][place.at, :3, :3]
+    T = fit.states[0][place.at, :3, :3]
     rates = np.einsum("kij,kj->ki", T, problem.intervals.rates[place.at])
     direction = T @ baseline
     return np.asarray(np.arctan2(direction[:, 0], direction[:, 1]) - rates[:, 2] * place.late)
@@ -114,7 +110,7 @@ def _factors(
 
     With u = R b, azimuth a = atan2(u_e, u_n) and R perturbed on the right, d u = -R [b]x d theta.
     """
-    R = from_values(fit.values, len(problem.intervals.keyframes))[0][place.at, :3, :3]
+    R = fit.states[0][place.at, :3, :3]
     u, (x, y, z) = R @ headings.baseline, headings.baseline
     by_turn = -R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     level = np.sum(u[:, :2] ** 2, axis=1)

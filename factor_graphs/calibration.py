@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from factor_graphs.chi_square import BEYOND_DOUBT, probability_below, quantile
 from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
-from factor_graphs.model import motion_from
 from factor_graphs.problem import Fit, Problem
 
 Array = NDArray[np.float64]
@@ -216,7 +215,7 @@ def scale_error(problem: Problem, fit: Fit) -> float:
 def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianFactor]:
     """The linear graph, with columns of lasting errors beside those of the IMU and of the fixes."""
     k, size, intervals = len(problem.intervals.keyframes), len(begins) + 5, problem.intervals
-    T, velocities = motion_from(fit.values)
+    T, velocities, _ = fit.states
     turned = np.add.reduceat(intervals.angular_rate * intervals.durations[:, None], intervals.bounds[:-1])
     axis = upright_axis(intervals.specific_force)
     rates = turned[:, axis] / np.diff(intervals.keyframes)

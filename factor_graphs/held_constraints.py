@@ -16,11 +16,10 @@ from factor_graphs.constraints import (
     resting,
     standing,
 )
-from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.fitting import FITTING_CHI2, fit_noise_from
 from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import WheelSpeeds
-from factor_graphs.model import from_values, zero_motion_factors, zero_velocity_factors
+from factor_graphs.model import zero_motion_factors, zero_velocity_factors
 from factor_graphs.problem import RELATIVE_TOLERANCE, ROUGH, Fit, Problem
 from factor_graphs.side_measurements import Observed, factors_of
 from factor_graphs.slip import Slip
@@ -206,13 +205,11 @@ def _observed(
 
 def _heading_if_gentle(problem: Problem, fit: Fit) -> float:
     """Usual standard deviation of the heading, rad; 0 where it is certainly small, for turns and braking show it."""
-    k = len(problem.intervals.keyframes)
-    T, velocities, _ = from_values(fit.values, k)
+    T, velocities, _ = fit.states
     changes = np.diff(velocities[:, :2], axis=0) / np.diff(problem.intervals.keyframes)[:, None]
     if np.quantile(np.linalg.norm(changes, axis=1), 0.9) > GENTLE:
         return 0.0
-    covariances, _ = keyframe_covariances(fit.graph, fit.values, k)
-    return float(np.median(stddevs_of_heading(T[:, :3, :3], covariances)))
+    return float(np.median(stddevs_of_heading(T[:, :3, :3], fit.covariances)))
 
 
 def _quiet(problem: Problem) -> NDArray[np.bool_]:

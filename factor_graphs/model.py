@@ -194,10 +194,10 @@ def to_values(T: Array, velocities: Array, biases: Array) -> gtsam.Values:
     return values
 
 
-def from_values(values: gtsam.Values, k: int) -> tuple[Array, Array, Array]:
+def from_values(values: gtsam.Values) -> tuple[Array, Array, Array]:
     """GTSAM values as keyframe states: poses (k, 4, 4), velocities (k, 3), biases (k, 6)."""
     T, velocities = motion_from(values)
-    return T, velocities, np.array([values.atConstantBias(B(i)).vector() for i in range(k)])
+    return T, velocities, np.array([values.atConstantBias(B(i)).vector() for i in range(len(T))])
 
 
 def motion_from(values: gtsam.Values) -> tuple[Array, Array]:

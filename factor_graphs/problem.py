@@ -15,12 +15,14 @@ from factor_graphs.alignment import (
     first_guess,
 )
 from factor_graphs.chi_square import probability_below, quantile
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
 from factor_graphs.least_squares import minimise
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.model import (
+    from_values,
     gnss_factors,
     imu_factors,
     motion_from,
@@ -139,6 +141,16 @@ class Fit:
     relative_squares: Array
     relative_weights: Array
     chi2_per_dof: float
+
+    @cached_property
+    def states(self) -> tuple[Array, Array, Array]:
+        """Poses (k, 4, 4), velocities (k, 3) and biases (k, 6) of the keyframes."""
+        return from_values(self.values)
+
+    @cached_property
+    def covariances(self) -> Array:
+        """Of (pose tangent, velocity, biases) of the keyframes, (k, 15, 15)."""
+        return keyframe_covariances(self.graph, self.values, len(self.states[0]))[0]
 
 
 def pose_problem(

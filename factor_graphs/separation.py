@@ -49,7 +49,7 @@ def separation_of(
 ) -> Separation:
     """The separation at k keyframes of a graph at its solution; `noise` tells what is known of biases before."""
     k = len(stamps)
-    T, _, biases = from_values(values, k)
+    T, _, biases = from_values(values)
     linear = graph.linearize(values)
     factors = [linear.at(n) for n in range(linear.size())]
     spans = np.array([_span(factor, k) for factor in factors])

@@ -37,7 +37,6 @@ from factor_graphs.measurements import (
     WheelSpeeds,
     measured,
 )
-from factor_graphs.model import from_values
 from factor_graphs.problem import (
     NOWHERE,
     REJECTION,
@@ -335,7 +334,7 @@ def _observe(one: Also, problem: Problem, fit: Fit, calibration: Calibration) ->
 
 def _solution(problem: Problem, held: _Constrained, fixes: GnssFixes, calibration: Calibration) -> Solution:
     fit, vehicle, wheels, covariances = held.fit, held.vehicle, held.wheels, held.covariances
-    T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
+    T, velocities, biases = fit.states
     shared_stddevs = np.sqrt(held.of_shared.diagonal())
     if vehicle is not None and vehicle.held:
         vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:5])

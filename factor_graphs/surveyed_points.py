@@ -15,10 +15,8 @@ from scipy.spatial import cKDTree
 
 from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.constraints import STANDING_SPEED
-from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.model import from_values
 from factor_graphs.problem import CARRIED_S, Fit, Problem
 from factor_graphs.side_measurements import Observed
 from factor_graphs.trajectory import Trajectory
@@ -134,9 +132,8 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit) -> Observ
     off = _off(points, problem, fit, at, late)
     fits = np.zeros(len(points), np.bool_)
     if len(there):
-        covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
-        R = from_values(fit.values, len(covariances))[0][at[there], :3, :3]
-        of_place = np.einsum("kij,kjl,kil->ki", R, covariances[at[there], 3:6, 3:6], R)
+        R = fit.states[0][at[there], :3, :3]
+        of_place = np.einsum("kij,kjl,kil->ki", R, fit.covariances[at[there], 3:6, 3:6], R)
         limits = BEYOND_DOUBT * np.sqrt(of_place + points.stddevs[there] ** 2) + LEAST_FITTING_M
         fits[there] = (np.abs(off[there]) < limits).all(axis=1)
     held = points.control & fits
@@ -181,7 +178,7 @@ def _keyframes(
 ) -> tuple[NDArray[np.intp], Array]:
     """The keyframe (n,) of every point, -1 for none, and how late (n,) s it was there."""
     keyframes = problem.intervals.keyframes
-    velocities = from_values(fit.values, len(keyframes))[1]
+    velocities = fit.states[1]
     antennas = _antennas(problem, fit)
     stands = np.flatnonzero(np.linalg.norm(velocities, axis=1) < STANDING_SPEED)
     at, late = np.full(len(points), -1), np.zeros(len(points))
@@ -199,13 +196,13 @@ def _keyframes(
 
 def _antennas(problem: Problem, fit: Fit) -> Array:
     """Where the antenna was at the keyframes, (k, 3) m."""
-    T = from_values(fit.values, len(problem.intervals.keyframes))[0]
+    T = fit.states[0]
     return np.asarray(T[:, :3, 3] + T[:, :3, :3] @ problem.p_imu_antenna)
 
 
 def _off(points: SurveyedPoints, problem: Problem, fit: Fit, at: NDArray[np.intp], late: Array) -> Array:
     """Estimated less surveyed, (n, 3) m; at keyframe -1 of no meaning."""
-    velocities = from_values(fit.values, len(problem.intervals.keyframes))[1]
+    velocities = fit.states[1]
     return np.asarray(_antennas(problem, fit)[at] + velocities[at] * late[:, None] - points.positions)
 
 
@@ -237,7 +234,7 @@ def _factors(
     fit: Fit,
 ) -> list[gtsam.NonlinearFactor]:
     """Every control point that is held holds the antenna of its keyframe."""
-    velocities = from_values(fit.values, len(problem.intervals.keyframes))[1]
+    velocities = fit.states[1]
     places = known.positions - velocities[at] * late[:, None]
     return [
         gtsam.GPSFactorArm(

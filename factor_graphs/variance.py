@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from factor_graphs.chi_square import quantile
 from factor_graphs.covariances import Places
 from factor_graphs.elimination import PLACES, SIZE, split_key
-from factor_graphs.model import from_values, motion_from
 from factor_graphs.problem import GATE, GOOD_MEAN, Fit, Problem
 
 Array = NDArray[np.float64]
@@ -75,7 +74,7 @@ def fix_noise_shown(problem: Problem, fit: Fit, covariances: Array) -> float:
     if 2 * good.sum() < len(good):
         return problem.of_fixes * min(float(np.sqrt(np.median(fit.squares) / quantile(0.5, 3))), MOST)
     at, (x, y, z) = problem.at[good], problem.p_imu_antenna
-    R_map_imu = motion_from(fit.values)[0][at, :3, :3]
+    R_map_imu = fit.states[0][at, :3, :3]
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     rows = problem.fixes.whitening[good] @ np.concatenate([-R_map_imu @ lever, R_map_imu], axis=2)
     taken = np.sum((rows @ covariances[at, :6, :6]) * rows)
@@ -121,10 +120,10 @@ def _corrected(now: float, squares: float, redundancy: float, enough: float) -> 
 
 def _of_walk(problem: Problem, fit: Fit, steps: BiasSteps) -> tuple[float, float]:
     """The squared whitened steps of the biases, and their redundancy."""
-    noise, k = problem.noise.scaled(1.0, fit.of_walk), len(problem.intervals.keyframes)
+    noise = problem.noise.scaled(1.0, fit.of_walk)
     density = np.repeat([noise.accelerometer_bias_walk, noise.gyroscope_bias_walk], 3)
     believed = density**2 * np.diff(problem.intervals.keyframes)[:, None]
-    walked = np.diff(from_values(fit.values, k)[2], axis=0)
+    walked = np.diff(fit.states[2], axis=0)
     return float(np.sum(walked**2 / believed)), float(np.sum(1 - steps.variance / believed))
 
 

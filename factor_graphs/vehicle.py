@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.intervals import nearest
-from factor_graphs.model import from_values
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 
@@ -159,7 +158,7 @@ class Vehicle:
 def body_motion(problem: Problem, fit: Fit) -> BodyMotion:
     """The motion at the keyframes of a solution."""
     stamps = problem.intervals.keyframes
-    T, velocities, biases = from_values(fit.values, len(stamps))
+    T, velocities, biases = fit.states
     R_imu_map = np.swapaxes(T[:, :3, :3], 1, 2)
     in_imu = (R_imu_map @ velocities[:, :, None])[:, :, 0]
     return BodyMotion(R_imu_map, in_imu, problem.intervals.rates - biases[:, 3:], np.gradient(stamps))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from factor_graphs.at_rest import Windows
+from factor_graphs.at_rest import QUIETEST_OF_DRIVE, are_quiet, means_of, windows
 from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.measurements import GnssFixes, ImuSamples
 
@@ -117,8 +117,9 @@ def _ways(fixes: GnssFixes) -> tuple[Array, NDArray[np.complex128], Array]:
 
 def _at_rest(imu: ImuSamples, fixes: GnssFixes) -> Array | None:
     """The median rate (3,) of the seconds in which the vehicle stands; None for less than a few of them."""
-    seconds = Windows.of(imu)
-    quiet, rates = seconds.quiet(0.1), seconds.rate
+    second = windows(imu)
+    quiet = are_quiet(second, imu.specific_force, imu.angular_rate, QUIETEST_OF_DRIVE)
+    rates = means_of(second, imu.angular_rate)
     stamps = np.arange(len(quiet)) + imu.stamps[0] + 0.5
     middles, ways, stddevs = _ways(fixes)
     if not len(ways):

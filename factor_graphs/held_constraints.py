@@ -8,10 +8,9 @@ import numpy as np
 from gtsam.symbol_shorthand import M, W
 from numpy.typing import NDArray
 
-from factor_graphs.constraints import (
+from factor_graphs.at_rest import (
     CREEPING_SPEED,
     creeping,
-    non_holonomic_factors,
     quiet_intervals,
     resting,
     standing,
@@ -24,7 +23,7 @@ from factor_graphs.problem import RELATIVE_TOLERANCE, ROUGH, Fit, Problem
 from factor_graphs.side_measurements import Observed, factors_of
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
-from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe
+from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, non_holonomic_factors, observe
 from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors
 
 Array = NDArray[np.float64]

@@ -13,8 +13,8 @@ from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from factor_graphs.at_rest import STANDING_SPEED
 from factor_graphs.chi_square import BEYOND_DOUBT
-from factor_graphs.constraints import STANDING_SPEED
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.problem import CARRIED_S, Fit, Problem

@@ -7,12 +7,16 @@ and c the angle at which tyres roll under lateral acceleration v_x w_z.
 Going backwards changes the sign of v_x and nothing else.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 
 from factor_graphs.intervals import nearest
+from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 
@@ -220,3 +224,17 @@ def direction(mounting: Array) -> Array:
     """The direction of travel in the imu's axes, (3,), by the slopes that the mounting (5,) begins with."""
     slopes = np.array([1.0, mounting[0], mounting[1]])
     return np.asarray(slopes / np.linalg.norm(slopes))
+
+
+def non_holonomic_factors(
+    values: gtsam.Values, motion: BodyMotion, stddevs: Array
+) -> Iterator[gtsam.NonlinearFactor]:
+    """The axle slides by `stddevs` (k, 2) m/s, lateral and vertical, linearised at `values`, which `motion` is of.
+
+    The mounting, M(k), is one unknown of all rows, and has a prior.
+    """
+    k = len(stddevs)
+    mounting = values.atVector(M(k))
+    by_state = motion.by_state(motion.by_velocity(mounting))
+    known = BodyVelocities(np.arange(k), motion.sliding(mounting), by_state, -motion.by_mounting(), stddevs)
+    return body_velocity_factors(values, known, M(k), np.zeros(5), MOUNTING_STDDEVS)

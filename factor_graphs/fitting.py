@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from factor_graphs.calibration import QUESTIONABLE, Calibration, clock_errors, correct
 from factor_graphs.chi_square import BEYOND_DOUBT
-from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.problem import (
     RELATIVE_TOLERANCE,
     ROUGH,
@@ -20,7 +19,7 @@ from factor_graphs.problem import (
     optimise,
 )
 from factor_graphs.settings import SmootherSettings
-from factor_graphs.variance import BiasSteps, fix_noise_shown, imu_noise_shown
+from factor_graphs.variance import ImuResiduals, fix_noise_shown, imu_noise_shown
 
 Array = NDArray[np.float64]
 
@@ -59,9 +58,9 @@ def fit_noise(problem: Problem) -> tuple[Problem, Fit]:
     if not problem.is_bound:
         noisier, better = problem, fit
         for _ in range(NOISE_ROUNDS):
-            covariances, steps = _covariances(problem, better)
-            of_fixes = fix_noise_shown(noisier, better, covariances)
-            noise = imu_noise_shown(noisier, better, covariances, steps)
+            shown = ImuResiduals(problem, better)
+            of_fixes = fix_noise_shown(noisier, better, shown.covariances)
+            noise = imu_noise_shown(better, shown)
             if of_fixes == noisier.of_fixes and noise == (better.inflation, better.of_walk):
                 break
             noisier, motion = noisier.with_fix_noise(of_fixes), motion_graph(problem, *noise)
@@ -116,19 +115,11 @@ def fit_noise_by_components(problem: Problem, fit: Fit) -> Fit:
     A vehicle constraint would hide noise: where an axle slides less than it is believed to, residuals are small.
     """
     for _ in range(NOISE_ROUNDS):
-        noise = imu_noise_shown(problem, fit, *_covariances(problem, fit))
+        noise = imu_noise_shown(fit, ImuResiduals(problem, fit))
         if noise == (fit.inflation, fit.of_walk):
             break
         fit = optimise(problem, motion_graph(problem, *noise), fit.values, noise, fit.loss)
     return fit
-
-
-def _covariances(problem: Problem, fit: Fit) -> tuple[Array, BiasSteps]:
-    """Covariances (k, 15, 15) of the keyframes, and variances of the steps of their biases."""
-    k = len(problem.intervals.keyframes)
-    steps = BiasSteps(k)
-    covariances, _ = keyframe_covariances(fit.graph, fit.values, k, steps)
-    return covariances, steps
 
 
 def calibrate(fit_to: FitTo, settings: SmootherSettings, given: Array) -> tuple[Problem, Fit, Calibration]:

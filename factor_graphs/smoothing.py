@@ -58,7 +58,7 @@ from factor_graphs.surveyed_points import (
     residuals_of,
 )
 from factor_graphs.trajectory import Trajectory
-from factor_graphs.variance import BiasSteps, imu_noise_shown
+from factor_graphs.variance import ImuResiduals, imu_noise_shown
 from factor_graphs.vehicle import Vehicle
 from factor_graphs.wheels import Wheels
 
@@ -301,13 +301,18 @@ def _constrained(
     everything is held again.
     """
     may_inflate = problem.settings.inflate_imu_noise and len(problem.relative) == 0
-    by_fixes, k = fit, len(problem.intervals.keyframes)
+    by_fixes = fit
     for is_last in (not may_inflate, True):
         held = hold_beside(problem, by_fixes, beside)
         fit, constraints, vehicle, wheels = constrain(problem, held, speeds, beside)
-        fit, steps = reject(problem, fit, constraints), BiasSteps(k)
-        covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k, None if is_last else steps)
-        if is_last or imu_noise_shown(problem, fit, covariances, steps) == (fit.inflation, fit.of_walk):
+        fit = reject(problem, fit, constraints)
+        if is_last:
+            k = len(problem.intervals.keyframes)
+            covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k)
+            break
+        shown = ImuResiduals(problem, fit)
+        covariances, of_shared = shown.covariances, shown.of_shared
+        if imu_noise_shown(fit, shown) == (fit.inflation, fit.of_walk):
             break
         by_fixes = fit_noise_by_components(problem, by_fixes)
     return _Constrained(fit, vehicle, wheels, covariances, of_shared)

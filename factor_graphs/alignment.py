@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
+from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.intervals import ImuIntervals, nearest
 from factor_graphs.measurements import GnssFixes
 
@@ -26,8 +27,6 @@ START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
 CRUISE_NOISE_DENSITY = 1.5
 # Course says nothing about heading below this speed, m/s, nor this far, s, from a fix.
 MIN_COURSE_SPEED, MAX_COURSE_AGE = 1.5, 1.5
-# The gyroscope's heading is tied to the course over this long, s.
-HEADING_WINDOW_S = 20.0
 # So far from the axis of the vehicle, rad, the imu looks aside.
 LOOKING_ASIDE = np.pi / 4
 # Over this long, s, a vehicle goes more forward than backward.
@@ -138,7 +137,7 @@ def attitudes(
         weight[0] = 1 / attitude.heading_stddev
         ahead[0] = np.exp(1j * np.arctan2(attitude.R_map_imu[1, 0], attitude.R_map_imu[0, 0]))
     # the course is along the axis of the vehicle, whether it goes forward or reverses
-    axis = _smooth(intervals.keyframes, ahead**2, weight, HEADING_WINDOW_S)
+    axis = _smooth(intervals.keyframes, ahead**2, weight, HEADING_HOLDS_S)
     axis = np.exp(0.5j * np.unwrap(np.angle(axis)))
     off = None if attitude else _off_axis(intervals, level, turned + np.angle(axis), velocities)
     if off is not None:

@@ -13,11 +13,12 @@ from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from factor_graphs.chi_square import BEYOND_DOUBT
+from factor_graphs.chi_square import BEYOND_DOUBT, huber_weights
 from factor_graphs.heading import stddevs_of_heading
+from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import AntennaHeadings
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.side_measurements import FEWEST_SEEN, HUBER, Observed, Placed, noise_scale, placed
+from factor_graphs.side_measurements import FEWEST_SEEN, Observed, Placed, noise_scale, placed
 
 Array = NDArray[np.float64]
 
@@ -26,8 +27,6 @@ SURE_HEADING = 0.1
 # An offset is one beyond doubt of the heading of the solution, and beyond this, rad: the place of an
 # antenna 1 m away is known to 1 cm.
 LEAST_OFFSET = 0.01
-# The heading of a solution is wrong by about the same for so long, s.
-SLOW_S = 20.0
 # A heading that scatters by more, rad, is of something else: one that scatters by three times less when it is mirrored,
 # or in another unit, is that.
 SCATTERED, MIRRORED = 0.3, 3.0
@@ -68,7 +67,7 @@ def _centre(angles: Array) -> float:
 
 def _quick(stamps: Array, off: Array) -> Array:
     """What changes quickly of angles (n,) rad: the solution's own error, by the gyroscope, does not."""
-    size = max(1, round(SLOW_S / float(np.median(np.diff(stamps)))))
+    size = max(1, round(HEADING_HOLDS_S / float(np.median(np.diff(stamps)))))
     return np.asarray(off - uniform_filter1d(off, size, mode="nearest"))
 
 
@@ -117,7 +116,7 @@ def _factors(
     rows = np.zeros((len(u), 1, 6))
     rows[:, 0, :3] = (u[:, 1, None] * by_turn[:, 0] - u[:, 0, None] * by_turn[:, 1]) / level[:, None]
     off = wrapped(headings.azimuths - _azimuths(problem, fit, place, headings.baseline)) / headings.stddevs
-    weights = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-9)))
+    weights = np.sqrt(huber_weights(off**2, 1))
     rows *= (weights / headings.stddevs)[:, None, None]
     unit = gtsam.noiseModel.Unit.Create(1)
     return [

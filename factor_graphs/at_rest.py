@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.chi_square import BEYOND_DOUBT
+from factor_graphs.chi_square import BEYOND_DOUBT, NEVER_ZERO
 from factor_graphs.errors import MeasurementError
 from factor_graphs.intervals import ImuIntervals
 from factor_graphs.measurements import GnssFixes, ImuSamples, gaps
@@ -122,7 +122,7 @@ def resting(stands: Mask, R_map_imu: Array, stamps: Array, gyroscope_noise_densi
 
 def _sums(which: Rows, values: Array, n: int) -> Array:
     """Sums of values by group, (n,), never zero: they are divided by."""
-    return np.maximum(np.bincount(which, values, n), 1e-12)
+    return np.maximum(np.bincount(which, values, n), NEVER_ZERO)
 
 
 def span_at_rest(imu: ImuSamples) -> ImuSamples:

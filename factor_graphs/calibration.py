@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.chi_square import BEYOND_DOUBT, probability_below, quantile
 from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
+from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.problem import Fit, Problem
 
 Array = NDArray[np.float64]
@@ -28,7 +29,7 @@ DOUBT = 1 - probability_below(BEYOND_DOUBT**2, 1)
 # A scale is in question where fixes and IMU alone show more than those of half of all good gyroscopes.
 QUESTIONABLE = 0.5
 # The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
-STRETCHES, SHORTEST_S, PLACED_S = 8, 20.0, 1.0
+STRETCHES, SHORTEST_S, PLACED_S = 8, HEADING_HOLDS_S, 1.0
 # Columns of an IMU factor: pose, velocity, pose, velocity, biases, biases.
 OF_IMU = np.cumsum([0, 6, 3, 6, 3, 6, 6])
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.calibration import QUESTIONABLE, Calibration, clock_errors, correct
-from factor_graphs.chi_square import BEYOND_DOUBT
+from factor_graphs.chi_square import BEYOND_DOUBT, NOTABLE, ROUNDS
 from factor_graphs.problem import (
     RELATIVE_TOLERANCE,
     ROUGH,
@@ -33,13 +33,9 @@ class FitTo(Protocol):
 # Residuals fit their standard deviations when chi2 per degree of freedom is in this range.
 FITTING_CHI2 = (0.8, 1.3)
 # Once begun, inflation goes on until here. It ends where it no longer helps: then something else does not fit.
-INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
-# White noise and walk of the IMU are looked at so often.
-NOISE_ROUNDS = 10
-# Fixes are taken for worse than they say when they are so many times: below that, an inflated IMU does no harm.
-NOTABLE_FIX_NOISE = 1.2
+INFLATED_CHI2, MAX_INFLATION, WORTHWHILE = 1.1, 1e4, 0.98
 # A correction is applied beyond so many of its standard deviations.
-NEGLIGIBLE, CALIBRATION_ROUNDS = 0.1, 6
+NEGLIGIBLE = 0.1
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
 LONG_ENOUGH_S = 120.0
 
@@ -57,7 +53,7 @@ def fit_noise(problem: Problem) -> tuple[Problem, Fit]:
         return problem, fit
     if not problem.is_bound:
         noisier, better = problem, fit
-        for _ in range(NOISE_ROUNDS):
+        for _ in range(ROUNDS):
             shown = ImuResiduals(problem, better)
             of_fixes = fix_noise_shown(noisier, better, shown.covariances)
             noise = imu_noise_shown(better, shown)
@@ -65,7 +61,7 @@ def fit_noise(problem: Problem) -> tuple[Problem, Fit]:
                 break
             noisier, motion = noisier.with_fix_noise(of_fixes), motion_graph(problem, *noise)
             better = optimise(noisier, motion, better.values, noise, fit.loss)
-        if noisier.of_fixes > NOTABLE_FIX_NOISE:
+        if noisier.of_fixes > NOTABLE:
             return noisier, better
     return problem, _inflated(problem, fit, [], RELATIVE_TOLERANCE, INFLATED_CHI2)
 
@@ -92,7 +88,7 @@ def _inflated(
 ) -> Fit:
     """The solution with so much noise of the IMU that chi2 per degree of freedom is at most `enough`."""
     stiff, loosest = fit, MAX_INFLATION
-    for _ in range(INFLATION_ROUNDS):
+    for _ in range(ROUNDS):
         step = float(np.clip(stiff.chi2_per_dof, 1.25, 8.0))
         inflation = min(stiff.inflation * step, float(np.sqrt(stiff.inflation * loosest)))
         noise = inflation, stiff.of_walk * inflation / stiff.inflation
@@ -114,7 +110,7 @@ def fit_noise_by_components(problem: Problem, fit: Fit) -> Fit:
 
     A vehicle constraint would hide noise: where an axle slides less than it is believed to, residuals are small.
     """
-    for _ in range(NOISE_ROUNDS):
+    for _ in range(ROUNDS):
         noise = imu_noise_shown(fit, ImuResiduals(problem, fit))
         if noise == (fit.inflation, fit.of_walk):
             break
@@ -136,7 +132,7 @@ def calibrate(fit_to: FitTo, settings: SmootherSettings, given: Array) -> tuple[
         return problem, fit, calibration
     if looks and problem.displaced:
         problem, fit, calibration = _by_clock(fit_to, given) or (problem, fit, calibration)
-    for _ in range(CALIBRATION_ROUNDS):
+    for _ in range(ROUNDS):
         errors, calibration = clock_errors(problem, fit, calibration, looks)
         offset, sigma = errors.clock_offset(calibration.begins)
         with_time |= looks and abs(offset) > BEYOND_DOUBT * sigma

@@ -12,7 +12,7 @@ import numpy as np
 from gtsam.symbol_shorthand import V
 from numpy.typing import NDArray
 
-from factor_graphs.chi_square import quantile
+from factor_graphs.chi_square import HUBER, quantile
 from factor_graphs.measurements import UNMEASURED, GnssVelocities
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.side_measurements import FEWEST_SEEN, Observed, Placed, noise_scale, placed
@@ -30,8 +30,7 @@ MISTAKES = {
     "north, east, not east, north": np.array([[0.0, 1.0], [1.0, 0.0]]),
     "backwards": -np.eye(2),
 }
-# One velocity in twenty of a good receiver has Huber's loss, and every wrong one.
-LOSS = gtsam.noiseModel.mEstimator.Huber.Create(quantile(0.95, 3) ** 0.5)
+LOSS = gtsam.noiseModel.mEstimator.Huber.Create(quantile(HUBER, 3) ** 0.5)
 
 
 def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit) -> Observed:
@@ -104,7 +103,9 @@ def _factors(
     of_imu = velocities.velocities - of_turn
     return [
         gtsam.PriorFactorVector(
-            V(i), velocity, gtsam.noiseModel.Robust.Create(LOSS, gtsam.noiseModel.Diagonal.Sigmas(stddevs))
+            V(i),
+            velocity,
+            gtsam.noiseModel.Robust.Create(LOSS, gtsam.noiseModel.Diagonal.Sigmas(stddevs)),
         )
         for i, velocity, stddevs in zip(place.at.tolist(), of_imu, velocities.stddevs, strict=True)
     ]

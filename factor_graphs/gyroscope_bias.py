@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from factor_graphs.at_rest import QUIETEST_OF_DRIVE, are_quiet, means_of, windows
-from factor_graphs.chi_square import BEYOND_DOUBT
+from factor_graphs.chi_square import BEYOND_DOUBT, NEVER_ZERO
 from factor_graphs.measurements import GnssFixes, ImuSamples
 
 Array = NDArray[np.float64]
@@ -32,7 +32,6 @@ SURELY, AGREEING = BEYOND_DOUBT**2 / 2, 0.5
 STAYING, LEAST_STANDING, STEADY = 3.0, 5, 3e-3
 # A mean specific force beyond these, m/s², is no gravity, and does not tell what is up.
 LEAST_FORCE, MOST_FORCE = 5.0, 20.0
-TINY = 1e-12
 
 
 def large_gyroscope_bias(imu: ImuSamples, fixes: GnssFixes) -> Array:
@@ -43,7 +42,7 @@ def large_gyroscope_bias(imu: ImuSamples, fixes: GnssFixes) -> Array:
     """
     nothing, fixes = np.zeros(3), fixes[(fixes.stamps >= imu.stamps[0]) & (fixes.stamps <= imu.stamps[-1])]
     force = imu.specific_force.mean(axis=0)
-    up = force / max(float(np.linalg.norm(force)), TINY)
+    up = force / max(float(np.linalg.norm(force)), NEVER_ZERO)
     if len(fixes) < 3 or not LEAST_FORCE < np.linalg.norm(force) < MOST_FORCE:
         return nothing
     rest = _at_rest(imu, fixes)
@@ -77,10 +76,12 @@ class _Courses:
         turned = np.interp(
             stamps, imu.stamps, cumulative_trapezoid(imu.angular_rate @ up, imu.stamps, initial=0)
         )
-        of_course = np.maximum(stddevs / np.maximum(np.abs(ways), TINY), LEAST_COURSE_STDDEV)
+        of_course = np.maximum(stddevs / np.maximum(np.abs(ways), NEVER_ZERO), LEAST_COURSE_STDDEV)
         # concentration of twice the angle (von Mises); one fix is in several ways
         weights = (
-            1 / (4 * of_course**2) / max(len(ways) * CHORD_S / max(float(np.ptp(fixes.stamps)), TINY), 1.0)
+            1
+            / (4 * of_course**2)
+            / max(len(ways) * CHORD_S / max(float(np.ptp(fixes.stamps)), NEVER_ZERO), 1.0)
         )
         return cls(stamps, weights * np.exp(2j * (np.angle(ways) - turned)))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.chi_square import quantile
+from factor_graphs.chi_square import RARE, quantile
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.problem import Problem, pose_problem
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 THETA, P, V, BA, BG = (slice(i, i + 3) for i in range(0, 15, 3))
 # A fix this unlikely is not used. After so many in a row it is the filter that is wrong, not the fixes.
-GATE, RE_ACQUIRE_AFTER = quantile(0.999, 3), 6
+GATE, RE_ACQUIRE_AFTER = quantile(RARE, 3), 6
 # What the first guess is good for: roll, pitch, heading rad, position m, speed m/s.
 GUESS_STDDEVS = (0.1, 0.1, 0.2, 5.0, 5.0, 5.0, 3.0, 3.0, 3.0)
 # The covariance is propagated once per so many IMU steps.

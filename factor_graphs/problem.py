@@ -14,8 +14,8 @@ from factor_graphs.alignment import (
     AttitudePrior,
     first_guess,
 )
-from factor_graphs.chi_square import probability_below, quantile
-from factor_graphs.covariances import keyframe_covariances
+from factor_graphs.chi_square import GOOD, HUBER, RARE, mean_below, quantile
+from factor_graphs.elimination import keyframe_covariances
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
@@ -36,12 +36,9 @@ from factor_graphs.settings import SmootherSettings
 
 Array = NDArray[np.float64]
 
-# 99 % of good measurements have a squared whitened residual below the first, 99.9 % below the second: fixes ...
-GATE, REJECTION = quantile(0.99, 3), quantile(0.999, 3)
-GOOD_MEAN = 3 * probability_below(GATE, 5) / probability_below(GATE, 3)
-# ... and relative poses.
-RELATIVE_GATE, RELATIVE_REJECTION = quantile(0.99, 6), quantile(0.999, 6)
-RELATIVE_GOOD_MEAN = 6 * probability_below(RELATIVE_GATE, 8) / probability_below(RELATIVE_GATE, 6)
+# Squared whitened residuals that are good, and beyond which they are rejected: of fixes and of relative poses.
+GATE, REJECTION = quantile(GOOD, 3), quantile(RARE, 3)
+RELATIVE_GATE, RELATIVE_REJECTION = quantile(GOOD, 6), quantile(RARE, 6)
 # A fix so near to a relative pose needs no keyframe of its own, s: it is carried there by velocity. Braking at 3 m/s²
 # moves it by 1 mm; a KITTI unit reports 10 to 23 ms after a scan, so the graph has half of the keyframes.
 CARRIED_S = 0.025
@@ -49,17 +46,15 @@ CARRIED_S = 0.025
 RELATIVE_TOLERANCE, ROUGH = 1e-5, 1e-3
 NOWHERE = np.empty(0)
 
-LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
-    "quadratic": None,
-    "huber": gtsam.noiseModel.mEstimator.Huber.Create(1.345),
-    "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(REJECTION**0.5),
-}
-# A norm of six residuals is larger than one of three: Huber's loss begins where it leaves the usual.
-RELATIVE_LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
-    "quadratic": None,
-    "huber": gtsam.noiseModel.mEstimator.Huber.Create(quantile(0.8, 6) ** 0.5),
-    "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(RELATIVE_REJECTION**0.5),
-}
+# The losses of fixes, and of relative poses: a norm of six residuals is larger than one of three.
+LOSSES, RELATIVE_LOSSES = (
+    dict[str, gtsam.noiseModel.mEstimator.Base | None](
+        quadratic=None,
+        huber=gtsam.noiseModel.mEstimator.Huber.Create(quantile(HUBER, dof) ** 0.5),
+        truncated=gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(quantile(RARE, dof) ** 0.5),
+    )
+    for dof in (3, 6)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,9 +316,8 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array, known:
     """
     good, relative_good = squares < GATE, relative_squares < RELATIVE_GATE
     total = motion + squares[good].sum() + relative_squares[relative_good].sum()
-    return float(
-        total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum() + known, GOOD_MEAN)
-    )
+    of_one, of_relative = mean_below(GATE, 3), mean_below(RELATIVE_GATE, 6)
+    return float(total / max(of_one * good.sum() + of_relative * relative_good.sum() + known, of_one))
 
 
 def _minimise(

@@ -11,6 +11,7 @@ agrees with the other pairs; and another one beside it says the same.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -19,7 +20,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
-from factor_graphs.chi_square import quantile
+from factor_graphs.chi_square import RARE, huber_weights, quantile
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
 from factor_graphs.elimination import SIZE
@@ -28,8 +29,7 @@ from factor_graphs.errors import EstimationError
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# 99.9 % of right pairs lie below, and where the loss of the others begins to grow slower.
-REJECTION, HUBER = quantile(0.999, 6), quantile(0.8, 6)
+REJECTION = quantile(RARE, 6)
 # The drives' own covariance is believed up to this factor of a standard deviation when a pair is held against it.
 BELIEVED = 1.5
 # Pairs support each other that are at most so many anchors apart, on both ways.
@@ -261,7 +261,7 @@ def _expected(system: _System, pairs: AnchorPairs, alone: _State) -> Array:
 def _robust(system: _System, pairs: AnchorPairs, used: Mask, start: _State) -> tuple[_State, Array, Array]:
     """The solution, weights (p,) and squared residuals (p,) of the pairs: Huber's loss first, then truncated."""
     state = start
-    for loss in (_huber, _truncated):
+    for loss in (partial(huber_weights, dof=6), _truncated):
         weights = np.full(len(pairs), -1.0)
         for _ in range(ROUNDS):
             squares = np.sum(system.residuals(pairs, state.poses)[1] ** 2, axis=1)
@@ -270,10 +270,6 @@ def _robust(system: _System, pairs: AnchorPairs, used: Mask, start: _State) -> t
             if np.abs(state.x - x).max(initial=0.0) < STILL and np.allclose(weights, before, atol=0.01):
                 break
     return state, weights, np.sum(system.residuals(pairs, state.poses)[1] ** 2, axis=1)
-
-
-def _huber(squares: Array) -> Array:
-    return np.minimum(1.0, np.sqrt(HUBER / np.maximum(squares, HUBER)))
 
 
 def _truncated(squares: Array) -> Array:

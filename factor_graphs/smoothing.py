@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.antenna_heading import observe_headings
 from factor_graphs.calibration import Calibration, in_order, scale_error, upright_axis
+from factor_graphs.chi_square import ROUNDS
 from factor_graphs.clock_check import checked, stamps_are_ends
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.consistent_fixes import with_consistent_fixes
-from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
 from factor_graphs.doubts import correlation, doubts
+from factor_graphs.elimination import keyframe_covariances
 from factor_graphs.errors import MeasurementError
 from factor_graphs.fitting import (
     calibrate,
@@ -71,8 +72,6 @@ Also = GnssVelocities | AntennaHeadings | SurveyedPoints
 HALF = 0.5
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
-# The scale of the gyroscope is corrected so many times at most: the first time, the noise of the IMU is not right yet.
-SCALE_ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +156,7 @@ def smooth(
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
     inertial = _Inertial.of(imu, fixes, settings)
     log = _Log(fixes, frame, settings, given, initial_attitude, relative, wheels, also)
-    for _ in range(SCALE_ROUNDS):
+    for _ in range(ROUNDS):
         problem, held, calibration, beside, inertial = log.solved(inertial)
         is_asked = calibration.scale_in_question and not problem.is_bound
         scale = scale_error(problem, held.fit) if is_asked else 0.0

@@ -12,21 +12,20 @@ import numpy as np
 from gtsam.symbol_shorthand import B
 from numpy.typing import NDArray
 
-from factor_graphs.chi_square import quantile
-from factor_graphs.covariances import Places, keyframe_covariances
-from factor_graphs.elimination import SIZE
-from factor_graphs.problem import GATE, GOOD_MEAN, Fit, Problem
+from factor_graphs.chi_square import GOOD, MOST_CHANGE, mean_below, quantile
+from factor_graphs.elimination import SIZE, Places, keyframe_covariances
+from factor_graphs.problem import GATE, Fit, Problem
 
 Array = NDArray[np.float64]
 
 # Within 99 % of what chance makes of it, noise is as expected. Found, it is good enough when it would change by less
 # than a share: a drive shows white noise to some 10 %, walk less well.
-CHANCE, ENOUGH, ENOUGH_OF_WALK = 0.99, 1.05, 1.1
+ENOUGH, ENOUGH_OF_WALK = 1.05, 1.1
 # Errors of fixes are correlated where those of neighbours are, by so much: with so many fixes it is beyond chance. For
 # so long, s, an IMU knows the way better than fixes.
 CORRELATED, FEWEST_CORRELATED, KNOWN_WAY_S = 0.3, 60, 5.0
-# A power of the ratio of variances that is changed by, one half if what unknowns take did not follow it; and the most.
-POWER, MOST = 0.75, 4.0
+# A power of the ratio of variances that is changed by: one half if what unknowns take did not follow it.
+POWER = 0.75
 
 
 class ImuResiduals:
@@ -76,13 +75,13 @@ def fix_noise_shown(problem: Problem, fit: Fit, covariances: Array) -> float:
     """
     good = fit.squares < GATE
     if 2 * good.sum() < len(good):
-        return problem.of_fixes * min(float(np.sqrt(np.median(fit.squares) / quantile(0.5, 3))), MOST)
+        return problem.of_fixes * min(float(np.sqrt(np.median(fit.squares) / quantile(0.5, 3))), MOST_CHANGE)
     at, (x, y, z) = problem.at[good], problem.p_imu_antenna
     R_map_imu = fit.states[0][at, :3, :3]
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     rows = problem.fixes.whitening[good] @ np.concatenate([-R_map_imu @ lever, R_map_imu], axis=2)
     taken = np.sum((rows @ covariances[at, :6, :6]) * rows)
-    expected = GOOD_MEAN / 3 * (3 * good.sum() - taken)
+    expected = mean_below(GATE, 3) / 3 * (3 * good.sum() - taken)
     return _corrected(problem.of_fixes, float(fit.squares[good].sum()), float(expected), ENOUGH)
 
 
@@ -116,7 +115,7 @@ def _steps(stamps: Array, whitened: Array, n: int, dt: float) -> tuple[float, fl
 
 def _corrected(now: float, squares: float, redundancy: float, enough: float) -> float:
     """The noise that squared residuals of a redundancy show, the same where it is good enough."""
-    if redundancy < 1 or (now == 1.0 and squares <= quantile(CHANCE, redundancy)):
+    if redundancy < 1 or (now == 1.0 and squares <= quantile(GOOD, redundancy)):
         return now
-    better = max(1.0, now * min(float(squares / redundancy) ** POWER, MOST))
+    better = max(1.0, now * min(float(squares / redundancy) ** POWER, MOST_CHANGE))
     return now if 1 / enough < better / now < enough else better

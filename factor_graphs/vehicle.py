@@ -15,10 +15,11 @@ import numpy as np
 from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 
+from factor_graphs.chi_square import robust_stddev
 from factor_graphs.intervals import nearest
 from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
+from factor_graphs.slip import SKID, UNSEEN, Slip, explain
 
 Array = NDArray[np.float64]
 
@@ -32,10 +33,6 @@ MOVING_SPEED, LEAST_TIME_S, LEAST_WAY_M = 2.0, 30.0, 200.0
 MOST_SLIP, MOST_SLOPE = 0.04, 0.3
 # Farther than this from a fix, s, a solution is too uncertain to show slip.
 BESIDE_S = 2.0
-# Slip, m/s, of what was not seen to slide.
-UNSEEN_SLIP = 0.1
-# A skid is so many times less certain than it is fast.
-SKID = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +169,8 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
     where = where_seen(problem, fit, motion)
     seen, skids = motion[where], np.zeros((len(where), 2))
-    time, way = seen.spacing.sum(), np.linalg.norm(seen.velocity, axis=1) @ seen.spacing
-    if time < LEAST_TIME_S or way < LEAST_WAY_M:
-        unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
-        doubt = f"it is seen to move for {time:.0f} s and {way:.0f} m only"
-        return Vehicle(np.zeros(5), (unseen, unseen), skids, doubt)
+    if doubt := too_seldom("it is seen to move", np.linalg.norm(seen.velocity, axis=1), seen.spacing):
+        return Vehicle(np.zeros(5), (UNSEEN, UNSEEN), skids, doubt)
     mounting, by_mounting, slip = np.zeros(5), seen.by_mounting(), []
     for row, part in enumerate((SIDEWAYS, UPWARDS)):
         known = by_mounting[:, row] @ mounting
@@ -190,6 +184,12 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
         )
         slip.append(its_slip)
     return Vehicle(mounting, (slip[0], slip[1]), skids, _doubt(mounting, seen))
+
+
+def too_seldom(seen: str, speeds: Array, spacing: Array) -> str:
+    """In words, that what is `seen` lasts too short or leads not far enough; empty where it does not."""
+    time, way = spacing.sum(), speeds @ spacing
+    return f"{seen} for {time:.0f} s and {way:.0f} m only" if time < LEAST_TIME_S or way < LEAST_WAY_M else ""
 
 
 def _doubt(mounting: Array, motion: BodyMotion) -> str:

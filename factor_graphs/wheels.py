@@ -13,26 +13,20 @@ import numpy as np
 from gtsam.symbol_shorthand import W
 from numpy.typing import NDArray
 
+from factor_graphs.chi_square import NEVER_ZERO, ROUNDS, robust_stddev
+from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
-from factor_graphs.vehicle import (
-    LEAST_TIME_S,
-    LEAST_WAY_M,
-    MOVING_SPEED,
-    UNSEEN_SLIP,
-    BodyMotion,
-    beside_fixes,
-    direction,
-)
+from factor_graphs.slip import SKID, UNSEEN, Slip, explain
+from factor_graphs.vehicle import MOVING_SPEED, BodyMotion, beside_fixes, direction, too_seldom
 
 Array = NDArray[np.float64]
 
 # Before anything is seen: scale, offset m/s, latency s, and how far left the imu is m.
 UNKNOWN, STDDEVS = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.3, 0.5, 0.2, 1.0])
-# Latency is found by so many corrections, none beyond this, s.
-LATENCY_ROUNDS, MOST_LATENCY_S = 3, 1.0
+# No latency is beyond this, s.
+MOST_LATENCY_S = 1.0
 # What differs from the speed by more than this share is no wheel, nor is one whose scale is beyond these.
 MOST_MISFIT, SCALES = 0.1, (0.8, 1.25)
 # How much m/s one unit is.
@@ -44,11 +38,11 @@ UNITS = {
     "0.01 km/h": 0.01 / 3.6,
     "0.1 km/h": 0.1 / 3.6,
 }
-# A wheel slips where it is so many standard deviations off; it is so many times less certain than it is fast.
-CUT, SKID = 3.5, 3.0
-# Without fixes a solution drifts: slip is then what differs from the median of so long, s. Where more than a share of
-# that time slips, all of it does: wheels that are frozen agree with the speed now and then.
-DRIFT_S, MOST_SLIP = 20.0, 1 / 3
+# A wheel slips where it is so many standard deviations off.
+SLIPPING = 3.5
+# Without fixes a solution drifts: slip is then what differs from the median of a window. Where more than a share of it
+# slips, all of it does: wheels that are frozen agree with the speed now and then.
+MOST_SLIP = 1 / 3
 # Once wheels hold it, it drifts no longer than this, s.
 HELD_S = 1.0
 # A wheel said to be at rest may creep, m/s; it is one value for so long, s.
@@ -209,15 +203,12 @@ def observe_wheels(
     """
     stamps, ahead = problem.intervals.keyframes, motion.ahead(mounting)
     calibration, beside = UNKNOWN if known is None else known, beside_fixes(problem, fit)
-    for step in range(LATENCY_ROUNDS if known is None else 1):
+    for step in range(ROUNDS if known is None else 1):
         readings = read(wheels, stamps + calibration[2], ahead)
         where = readings.rolling & beside & (np.abs(ahead) > MOVING_SPEED)
         spacing = motion.spacing[where]
-        time, way = spacing.sum(), np.abs(ahead[where]) @ spacing
-        if time < LEAST_TIME_S or way < LEAST_WAY_M:
-            unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
-            doubt = f"beside fixes they are seen to roll for {time:.0f} s and {way:.0f} m only"
-            return Wheels(readings, calibration, unseen, np.zeros(len(stamps)), doubt=doubt)
+        if doubt := too_seldom("beside fixes they are seen to roll", np.abs(ahead[where]), spacing):
+            return Wheels(readings, calibration, UNSEEN, np.zeros(len(stamps)), doubt=doubt)
         if known is None and step == 0:  # in whatever unit
             ratios = (ahead * readings.directions)[where] / readings.speeds[where]
             calibration = np.array([np.median(ratios), 0.0, 0.0, 0.0])
@@ -236,7 +227,7 @@ def observe_wheels(
     seen = Wheels(readings, calibration, noise, np.zeros(len(stamps)))
     doubt = _doubt(seen, misfit(ahead, motion.yaw_rate, readings, calibration)[0][where], ahead[where])
     density = problem.noise.accelerometer_noise_density * fit.inflation
-    drift = float(density * np.sqrt(DRIFT_S if known is None else HELD_S))
+    drift = float(density * np.sqrt(HEADING_HOLDS_S if known is None else HELD_S))
     return replace(_with_slip(seen, ahead, motion, beside, drift), doubt=doubt)
 
 
@@ -250,20 +241,20 @@ def _with_slip(
     readings = wheels.readings
     off, _ = misfit(ahead, motion.yaw_rate, readings, wheels.calibration)
     said = readings.rolling | readings.stopped
-    window = (np.cumsum(motion.spacing) / DRIFT_S).astype(int)
+    window = (np.cumsum(motion.spacing) / HEADING_HOLDS_S).astype(int)
     lost = said & ~beside
     for part in np.unique(window[lost]):
         off[lost & (window == part)] -= np.median(off[said & (window == part)])
     stddevs = np.sqrt(readings.grows_with() @ wheels.noise.parts)
     stddevs[readings.stopped] = CREEP
     stddevs[lost] = np.hypot(stddevs[lost], drift)
-    slips = said & (np.abs(off) > CUT * stddevs)
+    slips = said & (np.abs(off) > SLIPPING * stddevs)
     slip = np.where(slips, off, 0.0)
     for part in np.unique(window[slips]):
         its = said & (window == part)
         if slips[its].mean() > MOST_SLIP:
             slip[its] = np.sqrt(np.mean(off[its] ** 2))
-    share = motion.spacing[slip != 0].sum() / max(motion.spacing[said].sum(), 1e-12)
+    share = motion.spacing[slip != 0].sum() / max(motion.spacing[said].sum(), NEVER_ZERO)
     return replace(wheels, slip=slip, slip_share=float(share))
 
 

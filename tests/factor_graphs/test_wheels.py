@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import errors, nees
 from factor_graphs.chi_square import quantile
-from factor_graphs.covariances import keyframe_covariances
+from factor_graphs.elimination import keyframe_covariances
 from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.held_constraints import constrain

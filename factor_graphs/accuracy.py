@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import NEVER_ZERO, quantile
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 # Ellipsoids in which errors are counted hold these shares of them when covariances are true.
 SHARES = (0.5, 0.9, 0.95)

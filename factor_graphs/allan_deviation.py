@@ -8,15 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
 from factor_graphs.imu_noise import STANDARD_GRAVITY
 from factor_graphs.measurements import ImuSamples
-
-Array = NDArray[np.float64]
 
 # Clusters up to this share of the record: ten of them; so many times per decade, and from so many samples on, as
 # filters of the unit shape what is shorter.

@@ -10,17 +10,16 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import BEYOND_DOUBT, huber_weights
 from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import AntennaHeadings
+from factor_graphs.model import skew
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.side_measurements import FEWEST_SEEN, Observed, Placed, noise_scale, placed
-
-Array = NDArray[np.float64]
 
 # A solution whose heading is known better than this, rad, judges that of the antennas.
 SURE_HEADING = 0.1
@@ -110,8 +109,7 @@ def _factors(
     With u = R b, azimuth a = atan2(u_e, u_n) and R perturbed on the right, d u = -R [b]x d theta.
     """
     R = fit.states[0][place.at, :3, :3]
-    u, (x, y, z) = R @ headings.baseline, headings.baseline
-    by_turn = -R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    u, by_turn = R @ headings.baseline, -R @ skew(headings.baseline)
     level = np.sum(u[:, :2] ** 2, axis=1)
     rows = np.zeros((len(u), 1, 6))
     rows[:, 0, :3] = (u[:, 1, None] * by_turn[:, 0] - u[:, 0, None] * by_turn[:, 1]) / level[:, None]

@@ -1,17 +1,13 @@
 """When an IMU, and the vehicle that it is on, is at rest: by its own scatter, by its means, and by the fixes."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.chi_square import BEYOND_DOUBT, NEVER_ZERO
 from factor_graphs.errors import MeasurementError
 from factor_graphs.intervals import ImuIntervals
 from factor_graphs.measurements import GnssFixes, ImuSamples, gaps
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.intp]
 
 # What scatters no more than so many times as in the quietest parts may stand: those are a share of all, in a drive and
 # in a record at rest. Windows of a slow IMU are longer: the scatter of fewer samples is twice as large by chance.

@@ -14,14 +14,12 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import C
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import BEYOND_DOUBT, probability_below, quantile
 from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.problem import Fit, Problem
-
-Array = NDArray[np.float64]
 
 # What may be wrong before anything is estimated: clock s, antenna m, scale of the gyroscope.
 CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03

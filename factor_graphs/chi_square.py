@@ -6,10 +6,9 @@ By special functions: importing scipy.stats would take most of a second.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtr, gammaincinv
 
-Array = NDArray[np.float64]
+from factor_graphs.arrays import Array
 
 BEYOND_DOUBT = 5.0
 """In standard deviations: chance shows as much in one of two million drives."""

@@ -12,11 +12,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array
 from factor_graphs.elimination import PLACES, SIZE, eliminate, split, split_key, state_keys
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 # Without relative poses anchors are so far apart, s.
 ANCHOR_S = 1.5

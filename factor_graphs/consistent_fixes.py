@@ -13,16 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.chi_square import BEYOND_DOUBT, NEVER_ZERO, ROUNDS, quantile, robust_stddev
 from factor_graphs.measurements import LONGEST_STEP, GnssFixes
 from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, fit_as_expected
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.intp]
 
 # So many fixes, a second apart, on each side of a jump: in 10 s the error of the IMU's way is a cubic (position,
 # velocity, tilt, bias of the gyroscope).

@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Complex
 from factor_graphs.chi_square import NEVER_ZERO
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import GnssFixes, ImuSamples
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 # Long enough that a turn or a stop stands out from metres of noise.
 WINDOW_S = HEADING_HOLDS_S
@@ -31,7 +28,7 @@ def integral(stamps: Array, values: Array) -> Array:
     return np.concatenate([np.zeros_like(values[:1]), np.cumsum(parts, axis=0)])
 
 
-def way_of(imu: ImuSamples, lever: complex = 0j, *, mirrored: bool = False) -> NDArray[np.complex128]:
+def way_of(imu: ImuSamples, lever: complex = 0j, *, mirrored: bool = False) -> Complex:
     """The way of a point at `lever` m (ahead + i left) of an IMU with z up: (n,) m, up to a line and a parabola.
 
     East + i north up to a first heading: the accelerometer integrated twice along the gyroscope's heading.

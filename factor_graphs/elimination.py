@@ -17,10 +17,10 @@ from typing import Protocol, TypeVar
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, M, V, W, X
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
-Array = NDArray[np.float64]
+from factor_graphs.arrays import Array, Rows
+
 Graph = TypeVar("Graph", gtsam.NonlinearFactorGraph, gtsam.GaussianFactorGraph)
 Group = tuple[int, ...]
 """Keys that are eliminated together: those of one keyframe, or of what all keyframes share."""
@@ -146,7 +146,7 @@ def split_key(key: int) -> tuple[int, int]:
     return key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1
 
 
-Places = dict[int, NDArray[np.intp]]
+Places = dict[int, Rows]
 """Where the numbers of a key stand in a joint covariance."""
 
 
@@ -156,7 +156,7 @@ class Visitor(Protocol):
     `joint` is the covariance of all that are known now: the keyframe, in its 15 numbers, then y.
     """
 
-    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: Places) -> None: ...
+    def add(self, i: int, W: Array, rows: Rows, joint: Array, known: Places) -> None: ...
 
 
 def keyframe_covariances(
@@ -210,6 +210,6 @@ def _places(keys: list[int]) -> Places:
 
 
 @cache
-def _ranges(letters: tuple[int, ...]) -> list[NDArray[np.intp]]:
+def _ranges(letters: tuple[int, ...]) -> list[Rows]:
     ends = np.cumsum([0, *(len(PLACES[letter]) for letter in letters)]).tolist()
     return [np.arange(*both) for both in pairwise(ends)]

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import ROUNDS
 from factor_graphs.corrections import Correction
 from factor_graphs.errors import MeasurementError
@@ -16,8 +17,6 @@ from factor_graphs.model import relative_pose_factors
 from factor_graphs.problem import RELATIVE_LOSSES
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 # Fixes are not taken to be better than this, m: the lever arm and the clock are in it.
 LEAST_CLAIM_M = 0.3

@@ -10,15 +10,13 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Mask
 from factor_graphs.chi_square import HUBER, quantile
 from factor_graphs.measurements import UNMEASURED, GnssVelocities
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.side_measurements import FEWEST_SEEN, Observed, Placed, noise_scale, placed
 from factor_graphs.vehicle import MOVING_SPEED, beside_fixes
-
-Array = NDArray[np.float64]
 
 # Velocities that differ from those of the positions by more than this share of the speed are something else.
 MOST_MISFIT = 0.1
@@ -80,9 +78,7 @@ def _misfit(said: Array, known: Array) -> float:
     return float(np.median(np.linalg.norm(said - known, axis=1) / np.linalg.norm(known, axis=1)))
 
 
-def _noise_shown(
-    problem: Problem, fit: Fit, place: Placed, off: Array, stddevs: Array, seen: NDArray[np.bool_]
-) -> Array:
+def _noise_shown(problem: Problem, fit: Fit, place: Placed, off: Array, stddevs: Array, seen: Mask) -> Array:
     """As if of how many times more noise than stated velocities count, level and up, (2,): at least 1."""
     own = np.diagonal(fit.covariances[place.at, 6:9, 6:9], axis1=1, axis2=2)
     scales = np.ones(2)

@@ -7,14 +7,12 @@ optimiser does not come back from it. So what exceeds any calibrated unit is tak
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from factor_graphs.arrays import Array, Complex
 from factor_graphs.at_rest import QUIETEST_OF_DRIVE, are_quiet, means_of, windows
 from factor_graphs.chi_square import BEYOND_DOUBT, NEVER_ZERO
 from factor_graphs.measurements import GnssFixes, ImuSamples
-
-Array = NDArray[np.float64]
 
 # A bias below this, rad/s (0.6 deg/s), the graph finds by itself; above the second no gyroscope is of use.
 NOTABLE, LARGEST = 0.01, 0.2
@@ -67,7 +65,7 @@ class _Courses:
     """
 
     stamps: Array
-    doubled: NDArray[np.complex128]
+    doubled: Complex
 
     @classmethod
     def of(cls, imu: ImuSamples, fixes: GnssFixes, up: Array) -> "_Courses":
@@ -103,7 +101,7 @@ def _if_large(bias: Array) -> Array:
     return bias if NOTABLE < np.abs(bias).max() < LARGEST else np.zeros(3)
 
 
-def _ways(fixes: GnssFixes) -> tuple[Array, NDArray[np.complex128], Array]:
+def _ways(fixes: GnssFixes) -> tuple[Array, Complex, Array]:
     """From fix to fix: the middle of the time (n,) s, the way as a complex number, m, and its standard deviation, m."""
     first = np.arange(len(fixes))
     last = np.searchsorted(fixes.stamps, fixes.stamps + CHORD_S)

@@ -7,16 +7,14 @@ not known at all.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import BEYOND_DOUBT, RARE, quantile
 from factor_graphs.errors import EstimationError
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.model import to_values
 from factor_graphs.problem import Fit, Problem, fit_as_expected
-
-Array = NDArray[np.float64]
 
 # Slower than this, m/s, nearly always, the course does not tell the heading; a prior below this, rad,
 # does.

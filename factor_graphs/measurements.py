@@ -9,14 +9,13 @@ from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.errors import MeasurementError
 from factor_graphs.filled_gaps import filled_in
 from factor_graphs.imu_noise import ImuNoise as ImuNoise
 from factor_graphs.position_covariances import are_correlations, covariances_of
-
-Array = NDArray[np.float64]
 
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 # No accelerometer or gyroscope says more, in whatever unit.
@@ -58,7 +57,7 @@ class Measurements:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Self:
+    def __getitem__(self, rows: slice | Mask | Rows) -> Self:
         return replace(
             self, **{name: array[rows] for name, array in self._known() if name not in self.of_all}
         )
@@ -285,7 +284,7 @@ def clean_headings(
     return AntennaHeadings(columns[0], columns[1], columns[2], np.asarray(baseline, np.float64)), repairs
 
 
-def far_off(stamps: Array) -> NDArray[np.bool_]:
+def far_off(stamps: Array) -> Mask:
     """Which stamps (n,) s, finite, in any order, are not of the same drive as most: (n,).
 
     Between groups are breaks of ten minutes. A group is far off the largest one when it has a hundredth of its

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factor_graphs.alignment import (
     START_POSITION_STDDEV,
@@ -14,6 +13,7 @@ from factor_graphs.alignment import (
     AttitudePrior,
     first_guess,
 )
+from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.chi_square import GOOD, HUBER, RARE, mean_below, quantile
 from factor_graphs.elimination import keyframe_covariances
 from factor_graphs.errors import EstimationError, MeasurementError
@@ -33,8 +33,6 @@ from factor_graphs.model import (
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import FEWEST, are_new, correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
-
-Array = NDArray[np.float64]
 
 # Squared whitened residuals that are good, and beyond which they are rejected: of fixes and of relative poses.
 GATE, REJECTION = quantile(GOOD, 3), quantile(RARE, 3)
@@ -72,13 +70,13 @@ class Problem:
     p_imu_antenna: Array
     intervals: ImuIntervals
     noise: ImuNoise
-    used: NDArray[np.bool_]
+    used: Mask
     fixes: GnssFixes
-    at: NDArray[np.intp]
+    at: Rows
     late: Array
-    relative_used: NDArray[np.bool_]
+    relative_used: Mask
     relative: RelativePoses
-    relative_at: NDArray[np.intp]
+    relative_at: Rows
     attitude: AttitudePrior
     guess: tuple[Array, Array]
     notes: tuple[str, ...]
@@ -196,7 +194,7 @@ def pose_problem(
     )
 
 
-def _near(stamps: Array, others: Array) -> NDArray[np.bool_]:
+def _near(stamps: Array, others: Array) -> Mask:
     """Which of the stamps (m,) have another so near that a fix can be carried there."""
     if not len(others):
         return np.zeros(len(stamps), np.bool_)
@@ -204,9 +202,7 @@ def _near(stamps: Array, others: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(others[nearest(others, stamps)] - stamps) <= CARRIED_S)
 
 
-def usable_fixes(
-    fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float
-) -> tuple[NDArray[np.bool_], list[str]]:
+def usable_fixes(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> tuple[Mask, list[str]]:
     """Which fixes (n,) are new, within the IMU's span, and need no impossible speed; and what to say of the others.
 
     Raises MeasurementError below three.

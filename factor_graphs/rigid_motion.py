@@ -6,14 +6,13 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.arrays import Array
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 # Step of the one derivative that is numerical, s: central, so its error is 1e-8 of the third derivative.
 STEP_S = 1e-4

@@ -3,14 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.chi_square import robust_stddev
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from factor_graphs.settings import SmootherSettings
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # However slow the vehicle, two good fixes may differ by this much, m.
 ALLOWANCE_M = 50.0
@@ -57,7 +54,7 @@ def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:
     return max((_agreeing(fixes, runs, i, max_speed_mps) for i in longest), key=np.count_nonzero)
 
 
-def _agreeing(fixes: GnssFixes, runs: list[NDArray[np.intp]], believed: int, max_speed_mps: float) -> Mask:
+def _agreeing(fixes: GnssFixes, runs: list[Rows], believed: int, max_speed_mps: float) -> Mask:
     keep = np.zeros(len(fixes), dtype=bool)
     keep[runs[believed]] = True
     for outwards, facing in ((runs[believed + 1 :], 0), (runs[:believed][::-1], -1)):

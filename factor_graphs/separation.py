@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array
 from factor_graphs.elimination import (
     OF_KEYFRAME,
     SIZE,
@@ -23,8 +24,6 @@ from factor_graphs.elimination import (
 )
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.model import from_values
-
-Array = NDArray[np.float64]
 
 # The backward solution begins knowing no more than this: rad, m, m/s.
 LOOSE = (1.0, 1e3, 1e2)

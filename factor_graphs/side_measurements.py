@@ -9,13 +9,11 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.chi_square import NOTABLE, quantile
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.problem import CARRIED_S, Fit, Problem
-
-Array = NDArray[np.float64]
 
 # Seen so often, measurements show what they are.
 FEWEST_SEEN = 10
@@ -34,7 +32,7 @@ class Observed:
     factors: Callable[[Fit], list[gtsam.NonlinearFactor]] | None = None
     doubtful: bool = False
     turn: float = 0.0
-    points: tuple[Any, NDArray[np.bool_]] | None = None
+    points: tuple[Any, Mask] | None = None
     """Surveyed points with the moments that were found, and which of them are held."""
 
 
@@ -47,8 +45,8 @@ def factors_of(beside: Sequence[Observed], fit: Fit) -> list[gtsam.NonlinearFact
 class Placed:
     """Which of some stamps (n,) have a keyframe: `rows` (r,) of them, its number `at` (r,), and how `late` (r,) s."""
 
-    rows: NDArray[np.intp]
-    at: NDArray[np.intp]
+    rows: Rows
+    at: Rows
     late: Array
 
 

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, PchipInterpolator, make_interp_spline
 
+from factor_graphs.arrays import Array
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import (
@@ -22,8 +23,6 @@ from factor_graphs.measurements import (
     WheelSpeeds,
 )
 from factor_graphs.rigid_motion import Mounted, RigidMotion
-
-Array = NDArray[np.float64]
 
 # Suspension: the body rolls and pitches with the way driven, so that it is still when the vehicle is.
 _WAVELENGTHS_M = np.array([[31.0, 13.0], [23.0, 9.0]])

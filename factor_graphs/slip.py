@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import NEVER_ZERO, ROUNDS, huber_weights, probability_below, robust_stddev
 from factor_graphs.imu_noise import HEADING_HOLDS_S
-
-Array = NDArray[np.float64]
 
 # At first, slip is not believed to be less, m/s, for as long, s: a fifth of what a car on a road shows sideways. Once
 # the constraint is held, its residuals say more (`slip_variance.py`).

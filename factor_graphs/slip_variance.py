@@ -9,16 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam.symbol_shorthand import M
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Rows
 from factor_graphs.chi_square import MOST_CHANGE, NEVER_ZERO, NOTABLE
 from factor_graphs.elimination import SIZE, Places, keyframe_covariances
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import BLOCK_S, CUT, LEFT, Slip
 from factor_graphs.vehicle import Vehicle, body_motion, where_seen
-
-Array = NDArray[np.float64]
 
 # Blocks in a window over which drift of heading is taken from what is seen sideways; of pitch, gravity tells. The means
 # of each block are sideways and vertical.
@@ -36,7 +34,7 @@ class SumVariance:
     the mounting. `found` (w, m) is known once `keyframe_covariances` has gone through all keyframes.
     """
 
-    def __init__(self, rows: Array, windows: NDArray[np.intp], of_shared: Array) -> None:
+    def __init__(self, rows: Array, windows: Rows, of_shared: Array) -> None:
         self.found = np.zeros(of_shared.shape[:2])
         self._rows, self._windows, self._of_shared = rows, windows, of_shared
         self._first = {int(w): int(i) for i, w in reversed(list(enumerate(windows))) if w >= 0}
@@ -44,7 +42,7 @@ class SumVariance:
         self._beside = np.empty((0, rows.shape[1]))
         """Covariance of the keyframes known, in their order, and the sum."""
 
-    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: Places) -> None:
+    def add(self, i: int, W: Array, rows: Rows, joint: Array, known: Places) -> None:
         later = self._beside[rows] if len(self._beside) else np.zeros((len(rows), len(self._sum)))
         own, window = -W @ later, int(self._windows[i])
         if window >= 0:

@@ -10,9 +10,9 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.at_rest import STANDING_SPEED
 from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
@@ -20,8 +20,6 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.problem import CARRIED_S, Fit, Problem
 from factor_graphs.side_measurements import Observed
 from factor_graphs.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 # A point fits where neither its nor the solution's standard deviations leave a doubt, per axis, and this, m.
 LEAST_FITTING_M = 0.1
@@ -46,7 +44,7 @@ class SurveyedPoints:
     positions: Array
     stddevs: Array
     stamps: Array
-    control: NDArray[np.bool_]
+    control: Mask
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.positions).all() and (self.stddevs > 0).all()):
@@ -157,7 +155,7 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit) -> Observ
 
 def residuals_of(
     known: SurveyedPoints,
-    held: NDArray[np.bool_],
+    held: Mask,
     keyframes: Trajectory,
     p_imu_antenna: Array,
 ) -> tuple[PointResidual, ...]:
@@ -173,9 +171,7 @@ def residuals_of(
     return tuple(rows)
 
 
-def _keyframes(
-    points: SurveyedPoints, problem: Problem, fit: Fit, stamps: Array
-) -> tuple[NDArray[np.intp], Array]:
+def _keyframes(points: SurveyedPoints, problem: Problem, fit: Fit, stamps: Array) -> tuple[Rows, Array]:
     """The keyframe (n,) of every point, -1 for none, and how late (n,) s it was there."""
     keyframes = problem.intervals.keyframes
     velocities = fit.states[1]
@@ -200,13 +196,13 @@ def _antennas(problem: Problem, fit: Fit) -> Array:
     return np.asarray(T[:, :3, 3] + T[:, :3, :3] @ problem.p_imu_antenna)
 
 
-def _off(points: SurveyedPoints, problem: Problem, fit: Fit, at: NDArray[np.intp], late: Array) -> Array:
+def _off(points: SurveyedPoints, problem: Problem, fit: Fit, at: Rows, late: Array) -> Array:
     """Estimated less surveyed, (n, 3) m; at keyframe -1 of no meaning."""
     velocities = fit.states[1]
     return np.asarray(_antennas(problem, fit)[at] + velocities[at] * late[:, None] - points.positions)
 
 
-def _mistake(points: SurveyedPoints, off: Array, unfit: NDArray[np.intp], n: int) -> str:
+def _mistake(points: SurveyedPoints, off: Array, unfit: Rows, n: int) -> str:
     """What points that do not fit are, of n."""
     names = ", ".join(points.names[k] for k in unfit[:5])
     if len(unfit) < 2 or 2 * len(unfit) < n:
@@ -228,8 +224,8 @@ def _mistake(points: SurveyedPoints, off: Array, unfit: NDArray[np.intp], n: int
 def _factors(
     known: SurveyedPoints,
     problem: Problem,
-    rows: NDArray[np.intp],
-    at: NDArray[np.intp],
+    rows: Rows,
+    at: Rows,
     late: Array,
     fit: Fit,
 ) -> list[gtsam.NonlinearFactor]:

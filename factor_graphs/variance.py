@@ -10,13 +10,12 @@ may be noisy and steady. From fix to fix white noise counts, in an outage of a m
 
 import numpy as np
 from gtsam.symbol_shorthand import B
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Rows
 from factor_graphs.chi_square import GOOD, MOST_CHANGE, mean_below, quantile
 from factor_graphs.elimination import SIZE, Places, keyframe_covariances
+from factor_graphs.model import skew
 from factor_graphs.problem import GATE, Fit, Problem
-
-Array = NDArray[np.float64]
 
 # Within 99 % of what chance makes of it, noise is as expected. Found, it is good enough when it would change by less
 # than a share: a drive shows white noise to some 10 %, walk less well.
@@ -43,7 +42,7 @@ class ImuResiduals:
         self.redundancy, self.redundancy_of_walk = float(SIZE * (k - 1)), float(self._walk.size)
         self.covariances, self.of_shared = keyframe_covariances(fit.graph, fit.values, k, self)
 
-    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: Places) -> None:
+    def add(self, i: int, W: Array, rows: Rows, joint: Array, known: Places) -> None:
         """What the unknowns take from the factor between keyframe i and the next."""
         if i == len(self._walk):
             return
@@ -76,10 +75,10 @@ def fix_noise_shown(problem: Problem, fit: Fit, covariances: Array) -> float:
     good = fit.squares < GATE
     if 2 * good.sum() < len(good):
         return problem.of_fixes * min(float(np.sqrt(np.median(fit.squares) / quantile(0.5, 3))), MOST_CHANGE)
-    at, (x, y, z) = problem.at[good], problem.p_imu_antenna
+    at = problem.at[good]
     R_map_imu = fit.states[0][at, :3, :3]
-    lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rows = problem.fixes.whitening[good] @ np.concatenate([-R_map_imu @ lever, R_map_imu], axis=2)
+    by_pose = np.concatenate([-R_map_imu @ skew(problem.p_imu_antenna), R_map_imu], axis=2)
+    rows = problem.fixes.whitening[good] @ by_pose
     taken = np.sum((rows @ covariances[at, :6, :6]) * rows)
     expected = mean_below(GATE, 3) / 3 * (3 * good.sum() - taken)
     return _corrected(problem.of_fixes, float(fit.squares[good].sum()), float(expected), ENOUGH)

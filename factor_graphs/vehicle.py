@@ -13,15 +13,13 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import M
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Mask
 from factor_graphs.chi_square import robust_stddev
 from factor_graphs.intervals import nearest
 from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import SKID, UNSEEN, Slip, explain
-
-Array = NDArray[np.float64]
 
 # Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s², height m
 MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0, 0.01, 2.0])
@@ -52,7 +50,7 @@ class BodyMotion:
         """About the imu's z axis, (k,) rad/s."""
         return np.asarray(self.rates[:, 2])
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> "BodyMotion":
+    def __getitem__(self, rows: Mask) -> "BodyMotion":
         return BodyMotion(self.R_imu_map[rows], self.velocity[rows], self.rates[rows], self.spacing[rows])
 
     def sliding(self, mounting: Array) -> Array:
@@ -203,20 +201,20 @@ def _doubt(mounting: Array, motion: BodyMotion) -> str:
     return ""
 
 
-def where_seen(problem: Problem, fit: Fit, motion: BodyMotion) -> NDArray[np.bool_]:
+def where_seen(problem: Problem, fit: Fit, motion: BodyMotion) -> Mask:
     """The keyframes (k,) at which slip is seen: moving, and beside a fix that fits."""
     moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
     return np.asarray(moving & beside_fixes(problem, fit))
 
 
-def beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
+def beside_fixes(problem: Problem, fit: Fit) -> Mask:
     """The keyframes (k,) beside a fix that fits, not in an outage: no farther than fixes usually are apart."""
     stamps = problem.intervals.keyframes
     good = stamps[problem.at[fit.weights > 0.5]]
     if len(good) < 2:
         return np.zeros(len(stamps), dtype=bool)
     distance = np.abs(good[nearest(good, stamps)] - stamps)
-    beside: NDArray[np.bool_] = distance <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
+    beside: Mask = distance <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
     return beside
 
 

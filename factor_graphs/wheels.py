@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import W
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array, Mask
 from factor_graphs.chi_square import NEVER_ZERO, ROUNDS, robust_stddev
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import WheelSpeeds
@@ -20,8 +20,6 @@ from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import SKID, UNSEEN, Slip, explain
 from factor_graphs.vehicle import MOVING_SPEED, BodyMotion, beside_fixes, direction, too_seldom
-
-Array = NDArray[np.float64]
 
 # Before anything is seen: scale, offset m/s, latency s, and how far left the imu is m.
 UNKNOWN, STDDEVS = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.3, 0.5, 0.2, 1.0])
@@ -66,9 +64,9 @@ class Readings:
 
     speeds: Array
     changes: Array
-    rolling: NDArray[np.bool_]
-    stopped: NDArray[np.bool_]
-    moving: NDArray[np.bool_]
+    rolling: Mask
+    stopped: Mask
+    moving: Mask
     directions: Array
 
     def grows_with(self) -> Array:
@@ -110,9 +108,7 @@ def read(wheels: WheelSpeeds, stamps: Array, ahead: Array) -> Readings:
     return Readings(sign * speeds, sign * changes, rolling, stopped, moving, directions)
 
 
-def _directions(
-    wheels: WheelSpeeds, stamps: Array, speeds: Array, rolling: NDArray[np.bool_], ahead: Array
-) -> Array:
+def _directions(wheels: WheelSpeeds, stamps: Array, speeds: Array, rolling: Mask, ahead: Array) -> Array:
     """Forwards 1, backwards -1, unknown 0, (k,): one for all from stop to stop, where alone a vehicle turns back."""
     found = np.zeros(len(stamps))
     if not rolling.any():
@@ -231,9 +227,7 @@ def observe_wheels(
     return replace(_with_slip(seen, ahead, motion, beside, drift), doubt=doubt)
 
 
-def _with_slip(
-    wheels: Wheels, ahead: Array, motion: BodyMotion, beside: NDArray[np.bool_], drift: float
-) -> Wheels:
+def _with_slip(wheels: Wheels, ahead: Array, motion: BodyMotion, beside: Mask, drift: float) -> Wheels:
     """The same wheels with what does not fit, also where no fix is: there a solution drifts, but slowly.
 
     `drift` m/s is how far it may be off its median.

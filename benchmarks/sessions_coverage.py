@@ -23,7 +23,7 @@ from factor_graphs.simulation import Motion, random_drive
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
-from gnss_sem_map.datasets.kitti_raw import ATTITUDE_STDDEVS_RAD, OXTS_NOISE
+from gnss_sem_map.datasets.kitti_oxts import ATTITUDE_STDDEVS_RAD, OXTS_NOISE
 from gnss_sem_map.simulation.oxts import COLUMNS, Gnss, oxts_rows
 
 Array = NDArray[np.float64]

@@ -33,7 +33,7 @@ from factor_graphs.simulation import simulate_gnss, simulate_imu
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import open_drive
-from gnss_sem_map.datasets.kitti_raw import ATTITUDE_STDDEVS_RAD, OXTS_NOISE
+from gnss_sem_map.datasets.kitti_oxts import ATTITUDE_STDDEVS_RAD, OXTS_NOISE
 from gnss_sem_map.evaluation import map_sharpness
 from gnss_sem_map.evaluation.map_sharpness import Sharpness, SharpnessSettings
 from gnss_sem_map.scans.deskew import points_in_map

@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.datasets import frames, kitti_calibration, kitti_raw
+from gnss_sem_map.datasets import frames, kitti_calibration, kitti_oxts, kitti_raw, kitti_stamps
 from gnss_sem_map.datasets.kitti_odometry import read_table
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
@@ -91,13 +91,13 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     """Open a KITTI-360 drive; raises DataError when calibration, stamps or poses are missing or malformed."""
     root, name = _root(drive), drive.resolve().name
     about, poses = root / "calibration", root / "data_poses" / name
-    stamps_ns, skips = kitti_raw.stamps_ns(drive / "velodyne_points" / "timestamps.txt")
+    stamps_ns, skips = kitti_stamps.stamps_ns(drive / "velodyne_points" / "timestamps.txt")
     if not stamps_ns:
         raise DataError(f"{shown(drive / 'velodyne_points' / 'timestamps.txt')}: found no stamp")
     unit = None
     if is_folder(poses / "oxts"):
         twin = name.replace("_sync", "_extract")
-        unit = kitti_raw.navigation(
+        unit = kitti_oxts.navigation(
             poses, (poses.parent / twin, root / "data_poses_oxts_extract" / twin), with_imu
         )
         skips += unit.skips
@@ -118,7 +118,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         frame=frame,
         imu=unit.imu if unit else None,
         gnss=unit.gnss if unit else None,
-        imu_noise=kitti_raw.OXTS_NOISE if unit else None,
+        imu_noise=kitti_oxts.OXTS_NOISE if unit else None,
         initial_attitude=unit.attitude if unit else None,
         given=None if unit else track,
         reference=(track or unit.reference) if unit else None,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gnss_sem_map.datasets import csv_log, kitti_raw
+from gnss_sem_map.datasets import csv_log, kitti_oxts, kitti_raw
 from gnss_sem_map.datasets.ros.rig import NAME as RIG
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Image, Scan, SensorLog, file_of
@@ -33,8 +33,8 @@ Event = tuple[int, Callable[[int], None]]
 """Unix ns, and what writes the message of that moment."""
 Layout = Literal["kitti-raw", "table", "rosbag1", "mcap", "kitti-360"]
 TRUTH: Final = "truth"
-LAT, LON, ALT = kitti_raw.LAT, kitti_raw.LON, kitti_raw.ALT
-FORCE, RATE = kitti_raw.SPECIFIC_FORCE, kitti_raw.ANGULAR_RATE
+LAT, LON, ALT = kitti_oxts.LAT, kitti_oxts.LON, kitti_oxts.ALT
+FORCE, RATE = kitti_oxts.SPECIFIC_FORCE, kitti_oxts.ANGULAR_RATE
 IMAGE, INFO = "/camera/image_rect_color/compressed", "/camera/camera_info"
 
 
@@ -109,8 +109,8 @@ def _about_table(drive: Path, log: SensorLog) -> dict[str, Any]:
         "camera_time_offset_s": camera.time_offset_s,
         "imu_noise": noise.model_dump(),
         "initial_attitude": {
-            "quaternion_xyzw": kitti_raw.quaternions(_imu_rows(drive)[1][:1])[0].tolist(),
-            "stddevs_rad": kitti_raw.ATTITUDE_STDDEVS_RAD.tolist(),
+            "quaternion_xyzw": kitti_oxts.quaternions(_imu_rows(drive)[1][:1])[0].tolist(),
+            "stddevs_rad": kitti_oxts.ATTITUDE_STDDEVS_RAD.tolist(),
         },
     }
 
@@ -127,7 +127,7 @@ def _write_bag(drive: Path, log: SensorLog, out: Path, layout: Layout, progress:
         bag.write_transforms(
             start_ns, [("camera", "lidar", camera.T_camera_lidar), ("lidar", "imu", T_lidar_imu)]
         )
-        attitudes = kitti_raw.quaternions(imu)
+        attitudes = kitti_oxts.quaternions(imu)
         events: list[Event] = []
         for k, ns in enumerate(imu_ns.tolist()):
             events.append((ns, _later(bag.write_imu, imu[k, FORCE], imu[k, RATE], attitudes[k])))
@@ -282,14 +282,14 @@ def _ns(log: SensorLog, stamp: float) -> int:
 def _imu_rows(drive: Path) -> tuple[NDArray[np.int64], Array]:
     """Unix ns and oxts rows, at 100 Hz where the drive has its twin."""
     twin = drive.with_name(drive.name.replace("_sync", "_extract"))
-    stamps, rows, _ = kitti_raw.oxts_rows(twin if twin.is_dir() else drive)
+    stamps, rows, _ = kitti_oxts.oxts_rows(twin if twin.is_dir() else drive)
     return stamps, rows
 
 
 def _fixes(drive: Path) -> tuple[NDArray[np.int64], Array, Array]:
     """Unix ns, latitude, longitude, height (n, 3), and accuracy (n,) m."""
-    stamps, rows, _ = kitti_raw.oxts_rows(drive)
-    return stamps, rows[:, [LAT, LON, ALT]], rows[:, kitti_raw.POSITION_ACCURACY]
+    stamps, rows, _ = kitti_oxts.oxts_rows(drive)
+    return stamps, rows[:, [LAT, LON, ALT]], rows[:, kitti_oxts.POSITION_ACCURACY]
 
 
 def _cloud(scan: Scan) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS
-from gnss_sem_map.datasets import kitti_raw
+from gnss_sem_map.datasets import kitti_oxts
 from gnss_sem_map.process.machine import threads
 from gnss_sem_map.process.thread_pools import thread_pool
 from gnss_sem_map.simulation.compiled import Floats
@@ -70,10 +70,10 @@ def render_frames(
 def _write_tables(simulation: Simulation, drive: Path) -> None:
     """imu.csv at 100 Hz, gnss.csv at 10 Hz, and the stamps of scans and images."""
     rows, stamps = simulation.oxts, _seconds(simulation, simulation.oxts_stamps)
-    imu = np.column_stack([stamps, rows[:, kitti_raw.SPECIFIC_FORCE], rows[:, kitti_raw.ANGULAR_RATE]])
+    imu = np.column_stack([stamps, rows[:, kitti_oxts.SPECIFIC_FORCE], rows[:, kitti_oxts.ANGULAR_RATE]])
     _write_rows(drive / "imu.csv", IMU_COLUMNS, imu)
-    fixes, accuracy = rows[simulation.sync], rows[simulation.sync, kitti_raw.POSITION_ACCURACY]
-    places = fixes[:, [kitti_raw.LAT, kitti_raw.LON, kitti_raw.ALT]]
+    fixes, accuracy = rows[simulation.sync], rows[simulation.sync, kitti_oxts.POSITION_ACCURACY]
+    places = fixes[:, [kitti_oxts.LAT, kitti_oxts.LON, kitti_oxts.ALT]]
     gnss = np.column_stack([stamps[simulation.sync], places, accuracy, accuracy, accuracy])
     _write_rows(drive / "gnss.csv", GNSS_COLUMNS, gnss)
     for lidar in simulation.rig.lidars:
@@ -115,10 +115,10 @@ def _about(simulation: Simulation) -> dict[str, Any]:
             lidar.name: {"T_imu_lidar": lidar.T_imu_lidar.tolist()} for lidar in simulation.rig.lidars
         },
         "cameras": cameras,
-        "imu_noise": kitti_raw.OXTS_NOISE.model_dump(),
+        "imu_noise": kitti_oxts.OXTS_NOISE.model_dump(),
         "initial_attitude": {
-            "quaternion_xyzw": kitti_raw.quaternions(simulation.oxts[:1])[0].tolist(),
-            "stddevs_rad": kitti_raw.ATTITUDE_STDDEVS_RAD.tolist(),
+            "quaternion_xyzw": kitti_oxts.quaternions(simulation.oxts[:1])[0].tolist(),
+            "stddevs_rad": kitti_oxts.ATTITUDE_STDDEVS_RAD.tolist(),
         },
     }
 

@@ -1,14 +1,16 @@
 """What a track is of: segments that are too large for what moved are of something beside it."""
 
 import numpy as np
+import pytest
 
 from gnss_sem_map.dynamics.motion_state import GONE, Motion, MotionSettings, classify_motion
 from gnss_sem_map.dynamics.tracking import Segment
 
 
-def segment(scan, x, length):
-    """A segment of 50 points along x."""
-    outline = np.column_stack([np.linspace(x - length / 2, x + length / 2, 20), np.full(20, 8.0)])
+def segment(scan, x, length, width=0.0):
+    """A segment of 50 points along x, 8 m aside."""
+    across = np.tile([8.0, 8.0 + width], 10)
+    outline = np.column_stack([np.linspace(x - length / 2, x + length / 2, 20), across])
     return Segment(scan, 0.1 * scan, np.array([x, 8.0]), 50, False, False, outline.copy, np.zeros(2))
 
 
@@ -63,3 +65,20 @@ def test_a_parked_car_behind_which_another_passes_stays():
     misses = np.where(np.isin(np.arange(24), (17, 19, 21, 23)), 1500.0, 10.0)
     objects = classify_motion(segments, hits, misses, MotionSettings(), is_sharp=True)
     assert not any(one.motion in GONE for one in objects)
+
+
+@pytest.mark.parametrize(("width", "moves"), [(1.8, True), (6.0, False)])
+def test_what_comes_closer_and_waits_is_no_wider_than_a_vehicle(width, moves):
+    """It hides the place that it left. Of bushes and cars that stand, scans see now these and now those."""
+    places = [3.7 * min(scan / 12, 1.0) for scan in range(40)]
+    segments = [segment(scan, x, 5.0, width) for scan, x in enumerate(places)]
+    hits, misses = np.full(40, 2000.0), np.full(40, 60.0)
+    objects = classify_motion(
+        segments,
+        hits,
+        misses,
+        MotionSettings(),
+        is_sharp=True,
+        counted_in=lambda number, scans: (100.0, 50.0),
+    )
+    assert any(one.motion == Motion.MOVING for one in objects) == moves

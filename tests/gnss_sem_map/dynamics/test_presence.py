@@ -63,6 +63,28 @@ def test_a_segment_that_is_much_larger_than_most_of_its_track_holds_something_el
         assert np.flatnonzero(unusually_large([one], listed)).tolist() == expected
 
 
+def test_a_lorry_whose_cab_is_seen_first_is_as_long_as_its_trailer():
+    """From afar, in most scans, a few points show the cab; close by, many show both."""
+    lengths, points = [3.9] * 12 + [15.5] * 8, [200] * 12 + [30_000] * 8
+    listed = [
+        Segment(
+            scan,
+            0.1 * scan,
+            np.zeros(2),
+            count,
+            False,
+            False,
+            np.array([(0.0, 0.0), (m, 0.0)]).copy,
+            np.zeros(2),
+        )
+        for scan, (m, count) in enumerate(zip(lengths, points, strict=True))
+    ]
+    one = TrackedObject(
+        Motion.MOVING, 1.0, True, "", tuple(range(20)), sum(points), 0.0, 1.9, np.zeros((20, 2))
+    )
+    assert not unusually_large([one], listed).any()
+
+
 def points_at(p):
     """Segments of one scan: the points (n, 3) m, each a voxel; those at y < 5 are the only segment."""
     p = np.asarray(p, np.float64)

@@ -88,7 +88,7 @@ def test_a_folder_that_others_may_have_filled_is_not_taken(start: Start, tmp_pat
     done = start("-c", CALL)
     assert done.returncode == 0, done.stderr
     assert not list(planted.iterdir())
-    assert str(planted) not in done.stderr
+    assert f"{planted};" not in done.stderr
 
 
 def test_a_folder_that_the_user_names_is_taken_without_a_word(start: Start, tmp_path: Path) -> None:

@@ -26,8 +26,8 @@ def mover():
     way = 5.0 * stamps[:, None] * (0.6, 0.8)
     noisy = way + np.random.default_rng(2).normal(0.0, 0.1, way.shape)
     return Mover(
-        lidars=("left", "right"), name="vehicle", is_labelled=True, labelled=0.75, motion="moving", probability=1.0,
-        evidence="went 15.0 m", points=1234, size_m=(4.5, 1.8, 1.5), stamps=stamps, heights=0.1 * stamps,
+        lidars=("left", "right"), name="vehicle", kind="vehicle", is_labelled=True, labelled=0.75, motion="moving",
+        probability=1.0, evidence="went 15.0 m", points=1234, size_m=(4.5, 1.8, 1.5), stamps=stamps, heights=0.1 * stamps,
         track=smooth(stamps, noisy, np.full((31, 2), 0.1**2)),
     )  # fmt: skip
 

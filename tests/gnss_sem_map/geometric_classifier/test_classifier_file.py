@@ -91,7 +91,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], None], str]] = {
     "empty": (lambda p: p.write_bytes(b"") and None, "damaged file"),
     "a pickle": (lambda p: p.write_bytes(pickle.dumps({"format": [1]})) and None, "damaged file"),
     "gone": (Path.unlink, "cannot be used"),
-    "objects": (replaced("classes", of_objects()), "no plain array"),
+    "objects": (replaced("classes", of_objects()), "Python objects"),
     "huge leaves": (replaced("leaves_0", declared("(9000000000, 16)")), "at most"),
     "more leaves than there are": (replaced("leaves_1", declared("(1000000, 16)")), "as many as that needs"),
     "another format": (lambda p: rewritten(p, format=np.array([2])), "no classifier of format 1"),

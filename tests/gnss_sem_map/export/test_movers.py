@@ -27,8 +27,8 @@ def mover():
     noisy = way + np.random.default_rng(2).normal(0.0, 0.1, way.shape)
     return Mover(
         lidars=("left", "right"), name="vehicle", kind="vehicle", is_labelled=True, labelled=0.75, motion="moving",
-        probability=1.0, evidence="went 15.0 m", points=1234, size_m=(4.5, 1.8, 1.5), stamps=stamps, heights=0.1 * stamps,
-        track=smooth(stamps, noisy, np.full((31, 2), 0.1**2)),
+        probability=1.0, evidence="went 15.0 m", points=1234, size_m=(4.5, 1.8, 1.5), stamps=stamps,
+        heights=0.1 * stamps, track=smooth(stamps, noisy, np.full((31, 2), 0.1**2)),
     )  # fmt: skip
 
 

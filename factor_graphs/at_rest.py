@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
-from factor_graphs.measurements import ImuSamples, gaps
+from factor_graphs.measurements import ImuSamples
+from factor_graphs.stamps import gaps
 
 Array = NDArray[np.float64]
 

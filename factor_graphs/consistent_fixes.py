@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from factor_graphs.chi_square import quantile
 from factor_graphs.jumps import SIDE, SURELY, beyond_imu, find_jumps, is_jump
-from factor_graphs.measurements import LONGEST_STEP, GnssFixes
+from factor_graphs.measurements import GnssFixes
 from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, fit_as_expected
+from factor_graphs.stamps import LONGEST_STEP
 
 Array = NDArray[np.float64]
 

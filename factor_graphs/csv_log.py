@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.errors import MeasurementError, RepairWarning
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import (
-    UNITS,
     AntennaHeadings,
     GnssFixes,
     GnssVelocities,
@@ -25,12 +24,10 @@ from factor_graphs.measurements import (
     WheelSpeeds,
     clean_imu,
     clean_wheels,
-    far_off,
-    unit_fault,
-    unit_of_steps,
 )
 from factor_graphs.receiver_rows import GNSS_COLUMNS as GNSS_COLUMNS
 from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
+from factor_graphs.stamps import UNITS, far_off, unit_fault, unit_of_steps
 from factor_graphs.surveyed_points import SurveyedPoints, to_points
 from factor_graphs.table_dates import are_dates, seconds_of_dates, unix_scale
 from factor_graphs.tables import Column, Layout, layout_of
@@ -274,7 +271,7 @@ def _in_our_units(
                 days = table["date"].to_pylist()
                 texts = [f"{day} {text}" for day, text in zip(days, texts, strict=True)]
             values = seconds_of_dates(texts, epoch_ns)
-        elif kinds[name] == "string" or (name != STAMP and column == Column(column.at, 1.0, column.unit)):
+        elif kinds[name] == "string" or (name != STAMP and column.is_in_our_units):
             continue
         else:
             values = column.in_our_units(table[name].to_numpy().astype(np.float64))

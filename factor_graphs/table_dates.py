@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.stamps import DAY_S
+
 Array = NDArray[np.float64]
 
 DATE = re.compile(
@@ -21,7 +23,6 @@ FIRST_YEAR, LAST_YEAR = 1900, 2199
 """Of nanoseconds in 64 bits."""
 UNIX_FROM = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Larger numbers are no seconds of any year, but Unix time in ns, us, ms."""
-DAY_S = 86_400.0
 YEAR_FIRST, MONTH_FIRST, DAY_FIRST = (0, 1, 2), (2, 0, 1), (2, 1, 0)
 """Places of year, month and day."""
 

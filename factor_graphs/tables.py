@@ -107,6 +107,11 @@ class Column:
     unit: bool = False
     is_variance: bool = False
 
+    @property
+    def is_in_our_units(self) -> bool:
+        """Whether its numbers stay as they are."""
+        return self.scale == 1.0 and not self.is_variance
+
     def in_our_units(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
         """Numbers (n,) of this column in SI units or degrees; NaN for a variance below zero."""
         if not self.is_variance:

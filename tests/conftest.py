@@ -16,7 +16,9 @@ import street
 from declared import DATA, absent
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import Run, Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import Simulation
@@ -55,6 +57,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/simulation/test_sessions.py",
         "gnss_sem_map/simulation/test_town.py",
         "gnss_sem_map/test_attributes.py",
+        "gnss_sem_map/test_class_roles.py",
         "gnss_sem_map/test_finished_run.py",
         "gnss_sem_map/test_run_again.py",
     )
@@ -129,6 +132,14 @@ def small_track(small_log: SensorLog) -> Trajectory:
     """The poses of its navigation unit."""
     assert small_log.reference is not None
     return small_log.reference
+
+
+@pytest.fixture(scope="session")
+def finished(small_drive: street.Street, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run of the small drive with labels; read only. Its classifier is soon trained."""
+    out, labels = tmp_path_factory.mktemp("finished") / "out", f"labels:{small_drive.labels}"
+    settings = Settings().changed("geometric_classifier.rows_per_fold=1000")
+    return finished_run.run(small_drive.drive, out, labels, settings, write_labels=True, force=True)
 
 
 @pytest.fixture(scope="session")

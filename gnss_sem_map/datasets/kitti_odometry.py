@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.measurements import far_off
+from factor_graphs.stamps import far_off
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import frames, kitti_calibration
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.filled_gaps import filled_in
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import LARGEST_OF_IMU, GnssFixes, ImuNoise, ImuSamples, far_off
+from factor_graphs.measurements import LARGEST_OF_IMU, GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.stamps import far_off
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets import frames

@@ -7,7 +7,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.measurements import far_off, unit_fault
+from factor_graphs.stamps import far_off, unit_fault
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Skip
 

@@ -9,7 +9,7 @@ changes, an object that shows too little of itself may seem to move by what its 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,12 +60,11 @@ def own_motion(
     high: NDArray[np.float64],
     lidar: NDArray[np.float64],
     ranges: NDArray[np.float64],
-    width_m: float = 0.0,
 ) -> OwnMotion | None:
     """Motion of a track along its course; None for one of few scans.
 
     `low`, `high` and `lidar` (k,) m are the ends of what was seen of the object, and the LiDAR, along the course;
-    `ranges` (k,) m the distance between them; `width_m` is what it usually shows across.
+    `ranges` (k,) m the distance between them.
     """
     if len(low) < LEAST_SCANS:
         return None
@@ -88,7 +87,7 @@ def own_motion(
     way, largest = abs(steps).sum(), abs(steps).max(initial=0.0)
     largest = max(largest, _growth(centre[start : end + 1], (high - low)[placed][start : end + 1]))
     is_steady = bool(abs(shift) > STEADY_SHARE * way and largest < LARGEST_STEP_SHARE * abs(shift))
-    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady, length, width_m)
+    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady, length)
 
 
 def _growth(centre: NDArray[np.float64], extent: NDArray[np.float64]) -> float:
@@ -125,4 +124,5 @@ def motion_of(segments: Sequence[Segment]) -> OwnMotion | None:
     width = float(np.median([np.ptp(seen @ across) for seen in outlines]))
     lidar = np.array([one.seen_from @ along for one in whole])
     ranges = np.array([np.linalg.norm(one.centroid - one.seen_from) for one in whole])
-    return own_motion(ends[:, 0], ends[:, 1], lidar, ranges, width)
+    found = own_motion(ends[:, 0], ends[:, 1], lidar, ranges)
+    return None if found is None else replace(found, width_m=width)

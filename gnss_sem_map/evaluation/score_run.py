@@ -33,8 +33,6 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.process.machine import threads
 from gnss_sem_map.process.prefetch import prefetch
 
-"""Largest stamp in s and length in m."""
-
 FARTHEST_M = 1e4
 """What is so far from its truth on average is another drive, or has another origin."""
 

@@ -7,17 +7,24 @@ from typing import Any
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_json
-from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.files.untrusted import is_file, is_folder, shown
+from gnss_sem_map.files.work_folder import DRIVES
 
 
 def read_run(out: Path) -> dict[str, Any]:
-    """The content of run.json; raises DataError for a folder without one, or a damaged one."""
+    """The content of run.json; raises DataError where there is none, or a damaged one, or one of the former `merge`."""
     path = out / "run.json"
     if not is_file(path):
         raise DataError(
             f"{shown(path)}: no run folder here; expected the -o of an earlier `gnss-sem-map run`"
         )
-    return read_json(path)
+    about = read_json(path)
+    if "merged" in about and not is_folder(out / DRIVES):
+        raise DataError(
+            f"{shown(out)}: was merged by a version before this one, and keeps no drives; map them together with"
+            " `gnss-sem-map run DRIVE DRIVE`"
+        )
+    return about
 
 
 def inputs_of(out: Path) -> dict[str, str]:

@@ -28,9 +28,8 @@ def movable_and_known(
     `shown` (n,) as `LabelledScan.labels`. The class `other` may be a pole or a pedestrian, so it counts as unknown.
     """
     count = len(label_set.names)
-    is_movable = np.isin(
-        np.arange(count + 2), label_set.having(*MOVABLE)
-    )  # the last one, -1: not in an image
+    # of every class, of `other`, and, as the last, of what is not in an image
+    is_movable = np.isin(np.arange(count + 2), label_set.having(*MOVABLE))
     return is_movable.take(shown), (shown >= 0) & (shown < count)
 
 

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import BREAK_S, GnssFixes, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuSamples
 from factor_graphs.problem import usable_fixes
 from factor_graphs.settings import SmootherSettings
+from factor_graphs.stamps import BREAK_S
 from gnss_sem_map.preflight import poses
 from gnss_sem_map.preflight.clocks import FARTHEST_S, LEAP_S
 from gnss_sem_map.preflight.diagnosis import Diagnosis

@@ -216,9 +216,8 @@ def _scheduler_there(client: Client, address: str) -> Iterator[None]:
     try:
         yield
     except (OSError, AttributeError, CancelledError) as error:  # CommClosedError is an OSError
-        if (
-            isinstance(error, AttributeError) and client.scheduler is not None
-        ):  # a client that was closed has none
+        # a client that was closed has no scheduler
+        if isinstance(error, AttributeError) and client.scheduler is not None:
             raise
         raise DataError(f"scheduler {address}: was lost; see that it runs, and --resume") from None
 

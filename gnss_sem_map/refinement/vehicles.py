@@ -70,9 +70,8 @@ def apply(state: MapState, settings: VehicleSettings) -> MapState:
     voxels = state.voxels
     vehicle, road = classes_of(voxels.label_set, Role.VEHICLE, Role.ROAD)
     vehicles = voxels.label_set.having(Role.VEHICLE)
-    labels = np.where(
-        np.isin(state.labels, vehicles), np.int8(vehicle), state.labels
-    )  # one object may have several
+    # one object may have voxels of several classes
+    labels = np.where(np.isin(state.labels, vehicles), np.int8(vehicle), state.labels)
     if settings.method == "paper":
         found = paper(voxels.indices, labels, vehicle, road, settings, voxels.voxel_size_m)
         return replace(state, removed=state.removed | found.moving | found.rejected, vehicles=found.objects)

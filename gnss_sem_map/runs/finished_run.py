@@ -141,14 +141,9 @@ class Run:
         """Raises DataError for a folder that holds no finished map, or one of the former command `merge`."""
         folder = Path(folder)
         restore(folder, run_folder.is_run_file)
-        about = read_run(folder)
+        read_run(folder)
         if not is_folder(folder / "refined"):
             raise DataError(f"{shown(folder)}: found no map in it; expected the -o of `gnss-sem-map run`")
-        if "merged" in about and not is_folder(folder / DRIVES):
-            raise DataError(
-                f"{shown(folder)}: was merged by a version before this one, and keeps no drives; map them together"
-                " with `gnss-sem-map run DRIVE DRIVE`"
-            )
         return cls(folder)
 
     @property

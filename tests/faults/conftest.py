@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import street
-from faults.readers import small_street
+from faults.drive_files import small_street
 
 TRIALS: Counter[str] = Counter()
 

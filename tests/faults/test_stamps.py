@@ -11,7 +11,8 @@ from faults.harness import gnss_sem_map
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.intervals import split
-from factor_graphs.measurements import ImuSamples, far_off
+from factor_graphs.measurements import ImuSamples
+from factor_graphs.stamps import far_off
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import SemMapError
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
+from factor_graphs.stamps import DAY_S
 from factor_graphs.table_dates import are_dates, days_of, seconds_of_dates, unix_scale
 from factor_graphs.tables import NAMES, Column, Layout, layout_of
 from gnss_sem_map.datasets.gnss_files.positions import (
@@ -46,7 +47,7 @@ EXPECTED = (
     "expected RTKLIB, NMEA, or columns of time, latitude, longitude and height, such as Week GPSTime Latitude Longitude"
     " H-Ell"
 )
-DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
+WEEK_S = 7 * DAY_S
 LARGEST, LATEST_S = 1e19, (LAST_YEAR - 1970) * 366 * DAY_S
 """No number of a table is larger, and no time of a drive is later."""
 SIDES = {"lat_deg": ("N", "S"), "lon_deg": ("E", "W")}

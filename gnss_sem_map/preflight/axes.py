@@ -83,6 +83,20 @@ def probable(seen: Seen) -> tuple[AxesMistake, ...]:
     )
 
 
+def told_by_gravity_alone(seen: Seen, fitting: tuple[AxesMistake, ...]) -> tuple[AxesMistake, ...]:
+    """The ways to mount a unit on its side that fit as well as the first of the mistakes; empty where it need not be.
+
+    Without an answer to speeding up, bends or turns of another unit, gravity tells the axis that points up, no more.
+    """
+    first = fitting[0]
+    is_on_its_side = abs(first.force[2, 2]) < 0.5 and np.array_equal(first.force, first.rate)
+    if not is_on_its_side or any(known is not None for known in (seen.ahead, seen.left, seen.rates)):
+        return ()
+    return tuple(
+        m for m in fitting if np.array_equal(m.force[2], first.force[2]) and np.array_equal(m.force, m.rate)
+    )
+
+
 def askew(seen: Seen, mistake: AxesMistake) -> tuple[float, float, float]:
     """Roll, pitch and yaw, deg, by which an IMU is turned besides the mistake, as far as it was seen."""
     pairs = [(seen.up, Z), (seen.ahead, X), (seen.left, -Y if mistake.mirrored else Y)]

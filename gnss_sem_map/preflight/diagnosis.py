@@ -49,6 +49,13 @@ class Diagnosis:
     lag: Lag
     mirrored: bool
     """The track is."""
+    ahead: Array | None
+    """The direction (3,) that answers to speeding up; None where the drive does not show it."""
+
+    @property
+    def moves_untold(self) -> bool:
+        """Whether it moves, and shows no speeding up: then nothing tells which axis points forward."""
+        return self.ahead is None and self.track is not None and bool(self.track.is_moving.any())
 
     @property
     def is_right(self) -> bool:
@@ -89,7 +96,7 @@ def diagnose(
     findings += axes_findings
     probable = ImuSamples(imu.stamps, force @ mistake.force.T, rate @ mistake.rate.T)
     to_force, to_rate = mistake.force * FORCE_UNITS[unit], mistake.rate * scale
-    return Diagnosis(tuple(findings), to_force, to_rate, probable, track, lag, mistake.mirrored)
+    return Diagnosis(tuple(findings), to_force, to_rate, probable, track, lag, mistake.mirrored, seen.ahead)
 
 
 def _sampling(imu: ImuSamples) -> Finding:
@@ -192,6 +199,18 @@ def _axes(seen: Seen, gain: TurnGain | None) -> tuple[list[Finding], AxesMistake
             )
         ], axes.RIGHT
     mistake = fitting[0]
+    if len(ways := axes.told_by_gravity_alone(seen, fitting)) > 1:
+        up = "xyz"[int(np.abs(seen.up).argmax())]
+        sure = f"its {up} axis points {'up' if seen.up.sum() > 0 else 'down'}"
+        settings = [f'"{axes.axes_of(way.force)}"' for way in ways]
+        return [
+            red(
+                "IMU axes",
+                evidence,
+                f"the IMU is mounted on its side: {sure}, and nothing in this drive tells which axis points forward",
+                f"set imu_axes: {', '.join(settings[:-1])} or {settings[-1]}, as it is mounted",
+            )
+        ], mistake
     if mistake is not axes.RIGHT:
         alternatives = _alternatives(fitting)
         check = "GNSS track" if mistake.mirrored else "IMU axes"

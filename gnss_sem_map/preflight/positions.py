@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 LOWEST_M, HIGHEST_M = -600.0, 7000.0
 # Climbing more than this per metre driven is no road's, beyond so many metres that heights may be wrong by.
 STEEPEST, HEIGHT_ALLOWANCE_M = 0.5, 60.0
+# Few streets are steeper for so long; beside so many standard deviations of the heights, and so many m.
+STEEP_STREET, OF_HEIGHTS, LEAST_CLIMB_M = 0.2, 3.0, 3.0
 # A share of the fixes that is odd enough to be told of.
 NOTABLE_SHARE = 0.05
 # The data sheet of every RTK receiver says 8 mm + 1 ppm; none measures a moving vehicle better.
@@ -90,21 +92,25 @@ def _heights(fixes: GnssFixes, frame: LocalFrame) -> Iterator[Finding]:
     low, high = (float(h) for h in np.quantile(heights, [0.02, 0.98]))
     way = float(np.linalg.norm(np.ptp(fixes.positions[:, :2], axis=0)))
     evidence = f"heights from {low:.1f} to {high:.1f} m, over {way:.0f} m of ground"
-    if low < LOWEST_M or high > HIGHEST_M or high - low > STEEPEST * way + HEIGHT_ALLOWANCE_M + _doubt(fixes):
+    doubt = float(np.median(fixes.stddevs[:, 2]))
+    if low < LOWEST_M or high > HIGHEST_M or high - low > STEEPEST * way + HEIGHT_ALLOWANCE_M + 6 * doubt:
         yield red(
             "GNSS height",
             evidence,
             "the altitude is in mm (or cm, or feet)",
             "give alt_m in metres above the ellipsoid",
         )
+    elif high - low > STEEP_STREET * way + OF_HEIGHTS * doubt + LEAST_CLIMB_M:
+        yield amber(
+            "GNSS height",
+            f"{evidence}, which is steeper than streets are, and more than their {doubt:.2g} m explain",
+            "the heights wander: reflections, or a receiver without differential corrections",
+            "give larger stddevs of the heights, or fixes without those of few satellites",
+        )
     else:
         yield green(
             "GNSS height", f"{evidence}; alt_m is taken as height above the ellipsoid, not above the sea"
         )
-
-
-def _doubt(fixes: GnssFixes) -> float:
-    return 6.0 * float(np.median(fixes.stddevs[:, 2]))
 
 
 def _movement(fixes: GnssFixes, found: Fixes) -> Finding:

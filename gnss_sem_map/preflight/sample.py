@@ -25,7 +25,7 @@ from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 
 Array = NDArray[np.float64]
 LONGEST_S = 60.0
-"""Of a longer drive so much is smoothed, and looked at closely."""
+"""Of a longer drive so much is smoothed, and looked at closely; more of one that hardly shows its axes."""
 SCANS_PER_STRETCH, LEAST_STRETCHES, MOST_STRETCHES = 40, 3, 5
 """One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
 LONGEST_STRETCH_S = 3.0
@@ -95,7 +95,8 @@ class Sample:
         if self.diagnosis is not None:
             log = replace(log, imu=self.diagnosis.corrected(log.imu))
         try:
-            return smooth_log(log if self._is_short else _stretch_of(log), self.settings.trajectory)
+            stretch = log if self._is_short else _stretch_of(log, self._longest_s)
+            return smooth_log(stretch, self.settings.trajectory)
         except FactorGraphError:
             return None
 
@@ -103,7 +104,12 @@ class Sample:
     def _is_short(self) -> bool:
         """Whether the stretch that is smoothed is the whole drive."""
         imu = self.log.imu
-        return imu is not None and float(imu.stamps[-1] - imu.stamps[0]) <= LONGEST_S
+        return imu is not None and float(imu.stamps[-1] - imu.stamps[0]) <= self._longest_s
+
+    @property
+    def _longest_s(self) -> float:
+        """A slow vehicle speeds up less than its fixes scatter: minutes of it tell the heading of its IMU."""
+        return STRETCH_S if self.diagnosis is not None and self.diagnosis.moves_untold else LONGEST_S
 
     @property
     def stretches(self) -> tuple[Stretch, ...]:
@@ -232,19 +238,19 @@ def _way(a: Array, b: Array) -> float:
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3]) + 10.0 * turn)
 
 
-def _stretch_of(log: SensorLog) -> SensorLog:
+def _stretch_of(log: SensorLog, longest_s: float) -> SensorLog:
     """IMU and fixes of the stretch in which most way lies ahead."""
     assert log.imu is not None
     assert log.gnss is not None
     stamps, gnss = log.imu.stamps, log.gnss
-    starts = np.arange(stamps[0], stamps[-1] - LONGEST_S, LONGEST_S / 2)
+    starts = np.arange(stamps[0], stamps[-1] - longest_s, longest_s / 2)
     at = np.column_stack([np.interp(starts, gnss.stamps, p) for p in gnss.positions.T])
-    later = np.column_stack([np.interp(starts + LONGEST_S, gnss.stamps, p) for p in gnss.positions.T])
+    later = np.column_stack([np.interp(starts + longest_s, gnss.stamps, p) for p in gnss.positions.T])
     start = float(starts[np.argmax(np.linalg.norm(later - at, axis=1))])
     return replace(
         log,
-        imu=between(log.imu, start, start + LONGEST_S),
-        gnss=gnss[(gnss.stamps >= start) & (gnss.stamps <= start + LONGEST_S)],
+        imu=between(log.imu, start, start + longest_s),
+        gnss=gnss[(gnss.stamps >= start) & (gnss.stamps <= start + longest_s)],
         initial_attitude=log.initial_attitude if start == stamps[0] else None,
     )
 

@@ -52,6 +52,38 @@ def test_standing_and_driving_straight_are_green(speeds: tuple[float, ...]) -> N
     assert wrong(findings(SensorLog("x", 0, Calibration(np.eye(4)), (), (), FRAME, imu, fixes))) == []
 
 
+def test_of_a_unit_on_its_side_that_stands_only_the_axis_that_points_up_is_named() -> None:
+    log = drive(0, 20.0, ImuNoise())
+    assert log.imu is not None
+    still = ImuSamples(log.imu.stamps, np.tile([0.0, 9.81, 0.0], (len(log.imu), 1)), 0 * log.imu.angular_rate)
+    fixes = replace(log.gnss, positions=np.zeros_like(log.gnss.positions)) if log.gnss is not None else None
+    (found,) = (f for f in findings(replace(log, imu=still, gnss=fixes)) if f.check == "IMU axes")
+    assert (found.level, "y axis points up" in found.mistake) == (Level.RED, True)
+    ways = [matrix_of(axes) for axes in found.remedy.split('"')[1::2]]
+    assert len(ways) == 4
+    assert all(
+        np.array_equal(way @ [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]) and np.linalg.det(way) > 0 for way in ways
+    )
+
+
+def test_the_heading_of_a_slow_unit_is_compared_with_its_course() -> None:
+    """It speeds up less than fixes of a metre show, so only the smoothed heading tells that x points right."""
+    rng = np.random.default_rng(1)
+    way = np.arange(0.0, 400.0)
+    points = np.column_stack([way, 8 * np.sin(way / 8), np.zeros(len(way))])
+    motion = follow(points, [0.0, 5.0, 240.0], [0.0, 1.0, 1.0], 0.2)
+    imu = simulate_imu(motion, np.arange(0.0, 240.0, 0.04), FRAME, ImuNoise(), rng)
+    fixes = simulate_gnss(motion, np.arange(0.3, 239.5, 1.0), (1.0, 1.0, 2.0), rng=rng)
+    right = SensorLog("x", 0, Calibration(np.eye(4)), (), (), FRAME, imu, fixes)
+    aside = matrix_of("-y x z")  # x points to the right
+    for log, expected in ((right, []), (reporting(right, aside, aside), ["IMU mounting"])):
+        found = [f for f in findings(log) if f.level is not Level.GREEN]
+        assert [f.check for f in found] == expected
+        if found:
+            yaw = float(found[0].remedy.split(",")[-1].strip(" ]"))
+            assert abs(yaw + 90) < 10
+
+
 ONE = np.eye(3)
 BY_AXES = ["frd", "-x -y z", "y -x z", "-y x z", "-x y -z", "x -z y", "-z y x"]
 CASES: dict[str, tuple[Array, Array, str, SensorConventions]] = {

@@ -62,6 +62,23 @@ def test_radians_lie_at_sea(right: SensorLog) -> None:
     assert "radians" in said[0]
 
 
+def test_heights_that_wander_farther_than_streets_climb_are_told(right: SensorLog) -> None:
+    """A street of 12 % is none of that, nor are fixes that claim to be so poor."""
+    fixes = fixes_of(right)
+    climb = 0.4 * float(np.linalg.norm(np.ptp(fixes.positions[:, :2], axis=0)))
+
+    def said(share: float, stddev: float) -> str:
+        up = np.linspace(0.0, share * climb, len(fixes))
+        positions = np.column_stack([fixes.positions[:, :2], up])
+        stddevs = np.tile([1.0, 1.0, stddev], (len(fixes), 1))
+        log = replace(right, gnss=GnssFixes(fixes.stamps, positions, stddevs))
+        return next(str(found) for found in findings(log) if found.check == "GNSS height")
+
+    assert "the heights wander" in said(1.0, 2.0)
+    assert "wander" not in said(0.3, 2.0)
+    assert "wander" not in said(1.0, climb)
+
+
 @pytest.mark.parametrize("height", [115.0, 3.0, -20.0])
 def test_heights_in_millimetres_are_no_road(right: SensorLog, height: float) -> None:
     lat, lon, alt = FRAME.to_geodetic(fixes_of(right).positions)

@@ -44,6 +44,41 @@ FILES = (("calibration",), ("classes",), ("geometric_classifier", "model"), ("de
 """Settings that name a file; classes without an ending are a shipped set."""
 
 
+class Nav2Settings(BaseModel):
+    """What the robot of `--format nav2` can do."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    robot_height_m: float = Field(
+        1.5, gt=0, le=10, description="What is higher over the ground is no obstacle: branches, bridges."
+    )
+    step_m: float = Field(
+        0.08, ge=0, description="Highest step that it climbs, and what is lower is no obstacle: kerbs are."
+    )
+    slope_deg: float = Field(10.0, gt=0, le=45, description="Steepest ground that it drives on.")
+    cell_m: float | None = Field(
+        None, gt=0, description="Edge of a cell, a multiple of the voxels'; null: theirs."
+    )
+
+    @model_validator(mode="after")
+    def _fits_under_itself(self) -> Nav2Settings:
+        if self.step_m >= self.robot_height_m:
+            raise ValueError(
+                f"step_m is {self.step_m:g} and robot_height_m {self.robot_height_m:g}; expected a lower step"
+            )
+        return self
+
+
+class TerrainSettings(BaseModel):
+    """How far from where it was seen the ground is known."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    farthest_m: float = Field(
+        3.0, gt=0, le=50, description="Ground farther from where ground was seen is unknown."
+    )
+
+
 class DeliverySettings(BaseModel):
     """Coordinates and labels of the files that a map is exported to; the map itself stays as it is."""
 
@@ -60,6 +95,8 @@ class DeliverySettings(BaseModel):
     min_confidence: float = Field(
         0.0, ge=0, le=1, description="Voxels whose label is less sure than this are written as unlabelled."
     )
+    nav2: Nav2Settings = Field(Nav2Settings(), description="The robot of `export --format nav2`.")
+    terrain: TerrainSettings = Field(TerrainSettings(), description="The ground of `export --format terrain` and `nav2`.")
 
 
 class Settings(BaseModel):

@@ -67,8 +67,8 @@ def export(
         str,
         typer.Option(
             "--format",
-            help="Some of viewer, laz, removed, ply, geotiff, geopackage, topview, perspective, flight, copc; "
-            "with commas.",
+            help="Some of viewer, laz, removed, ply, geotiff, geopackage, topview, perspective, flight, copc, nav2, "
+            "terrain; with commas.",
         ),
     ],
     out: Annotated[

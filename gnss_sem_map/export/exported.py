@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.config import Nav2Settings, TerrainSettings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.labels.label_set import UNLABELLED
@@ -39,6 +40,10 @@ class Exported:
     geoid: Path | None = None
     attributes: TiledAttributes | None = None
     """Of its voxels; None where they are not known."""
+    raw: TiledMap | None = None
+    """The map before refinement, which knows how high the points lie in their voxels."""
+    nav2: Nav2Settings = Nav2Settings()
+    terrain: TerrainSettings = TerrainSettings()
 
     def tiles(self) -> Iterator[tuple[SemanticMap, Attributes | None]]:
         """The map tile by tile, with the attributes of its voxels; raises DataError."""
@@ -48,6 +53,20 @@ class Exported:
         """One of them."""
         piece = self.map.read_tile(tile)
         return piece, None if self.attributes is None else self.attributes.of(tile, piece.voxels.keys)
+
+    @cached_property
+    def measured(self) -> TiledMap:
+        """The map with the heights of the points that stand in its voxels, and their number, where they are known."""
+        return self.map if self.raw is None else replace(self.map, read_tile=self._measured_tile)
+
+    def _measured_tile(self, tile: Tile) -> SemanticMap:
+        piece = self.map.read_tile(tile)
+        assert self.raw is not None
+        if tile not in self.raw.tiles or (raw := self.raw.read_tile(tile).voxels).heights is None:
+            return piece
+        places = raw.indices_of(piece.voxels.keys)  # -1: of what moved alone
+        hits, heights = (np.where(places >= 0, values[places], 0) for values in (raw.hits, raw.heights))
+        return replace(piece, voxels=replace(piece.voxels, hits=hits, heights=heights))
 
     @cached_property
     def georeference(self) -> Georeference | None:

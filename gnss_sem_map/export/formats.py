@@ -11,9 +11,11 @@ from gnss_sem_map.export.copc import write_copc
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.flight import write_flight
 from gnss_sem_map.export.geopackage import write_geopackage
+from gnss_sem_map.export.nav2 import write_nav2
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
 from gnss_sem_map.export.raster import write_topview_geotiff
+from gnss_sem_map.export.terrain import write_terrain
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.process.run_stats import Progress, silent
@@ -26,6 +28,7 @@ class Format:
 
     name: str
     file: str
+    """Or the folder of several."""
     what: str
     write: Callable[[Exported, Path], None]
     needs_georeference: bool = False
@@ -71,6 +74,14 @@ FORMATS = (
     Format(
         "copc", "map.copc.laz", "map.laz as an octree that is read in parts, for streaming and web viewers",
         write_copc, on_demand=True,
+    ),
+    Format(
+        "nav2", "nav2", "occupancy grid and costmap for robots, as Nav2 reads them",
+        write_nav2, on_demand=True,
+    ),
+    Format(
+        "terrain", "terrain", "heights of the ground (dtm.tif) and of the surface (dsm.tif), with standard deviations",
+        write_terrain, needs_georeference=True, on_demand=True,
     ),
 )  # fmt: skip
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
@@ -18,6 +19,9 @@ from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.voxels.tile_files import TILE_BITS
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetWriter
 
 NOTHING = -2
 """Label of a cell without any voxel."""
@@ -54,7 +58,7 @@ def top_view(exported: Exported, longest_side: int) -> TopView:
     The view ends where the labelled voxels end; removed ones are not seen, unless all are. A cell is one voxel, or as
     many as keep the longer side within `longest_side` cells. Raises DataError for a map without voxels.
     """
-    cells, voxel_m = _Cells.of(exported.extent, longest_side), exported.map.voxel_size_m
+    cells, voxel_m = Cells.of(exported.extent, longest_side), exported.map.voxel_size_m
     labels, rank, inferred = _seen_in_rows(exported, cells, 0, cells.rows)
     tops = np.where(rank > ABOVE_ALL // 2, rank - ABOVE_ALL, rank)
     heights = np.where(labels == NOTHING, np.float32(np.nan), tops * np.float64(voxel_m)).astype(np.float32)
@@ -63,7 +67,7 @@ def top_view(exported: Exported, longest_side: int) -> TopView:
 
 
 @dataclass(frozen=True)
-class _Cells:
+class Cells:
     """The cells of a view: how many voxels wide, the edges west and north in cells from the origin, and how many."""
 
     per_cell: int
@@ -73,7 +77,7 @@ class _Cells:
     columns: int
 
     @classmethod
-    def of(cls, extent: Extent, longest_side: int) -> _Cells:
+    def of(cls, extent: Extent, longest_side: int) -> Cells:
         if not extent.count:
             raise DataError(NO_VOXELS)
         per_cell = max(1, -(-(1 + int((extent.high - extent.low)[:2].max())) // longest_side))
@@ -83,7 +87,7 @@ class _Cells:
 
 
 def _seen_in_rows(
-    exported: Exported, cells: _Cells, first: int, end: int
+    exported: Exported, cells: Cells, first: int, end: int
 ) -> tuple[NDArray[np.int8], NDArray[np.int32], NDArray[np.bool_]]:
     """Rows [first, end) of a view: label and rank of the voxel that is seen, and whether it is inferred.
 
@@ -125,35 +129,51 @@ def write_topview_geotiff(exported: Exported, path: Path | str) -> None:
     or more where the raster would exceed 10,000 on a side. Raises DataError for an empty map, for one without a
     georeference, or when the file cannot be written.
     """
+    georeference, label_set = exported.georeference_for("a GeoTIFF"), exported.map.label_set
+    cells = Cells.of(exported.extent, GEOTIFF_LONGEST_SIDE)
+    grid = Grid.over(cells, exported, georeference)
+    with new_cog(path, grid, georeference, "mode", dtype="uint8", count=1, nodata=GEOTIFF_NODATA) as tiff:
+        for corner, block in _blocks(exported, cells, grid, georeference):
+            tiff.write(block, 1, window=window_of(corner, block.shape))
+        tiff.write_colormap(1, _colour_table(label_set))
+        tiff.update_tags(1, **{f"class_{i}": name for i, name in enumerate(label_set.legend.names)})
+
+
+@contextmanager
+def new_cog(
+    path: Path | str, grid: Grid, georeference: Georeference, resampling: str, **profile: Any
+) -> Iterator[DatasetWriter]:
+    """A GeoTIFF of a grid to write bands into; when the block succeeds, it becomes a cloud-optimised file.
+
+    `resampling` is for its overviews. Raises DataError when the file cannot be written.
+    """
     import rasterio
     import rasterio.shutil
     from rasterio.enums import Resampling
 
-    georeference, label_set = exported.georeference_for("a GeoTIFF"), exported.map.label_set
-    cells = _Cells.of(exported.extent, GEOTIFF_LONGEST_SIDE)
-    grid = _Grid.over(cells, exported, georeference)
-    profile = {
-        "driver": "GTiff", "dtype": "uint8", "count": 1, "nodata": GEOTIFF_NODATA, "compress": "deflate",
-        "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "width": grid.columns, "height": grid.rows,
-        "crs": f"EPSG:{georeference.horizontal_epsg}",
+    profile |= {
+        "driver": "GTiff", "compress": "deflate", "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK,
+        "width": grid.columns, "height": grid.rows, "crs": f"EPSG:{georeference.horizontal_epsg}",
         "transform": rasterio.Affine(grid.cell_m, 0, grid.west, 0, -grid.cell_m, grid.north),
     }  # fmt: skip
     # GDAL would notice a full disk too late, and keep a twentieth of the memory full of blocks
     with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES), rasterio.MemoryFile() as memory:
         with memory.open(**profile) as tiff:
-            for corner, block in _blocks(exported, cells, grid, georeference):
-                tiff.write(block, 1, window=tuple(zip(corner, np.add(corner, block.shape), strict=True)))
-            tiff.write_colormap(1, _colour_table(label_set))
-            tiff.update_tags(1, **{f"class_{i}": name for i, name in enumerate(label_set.legend.names)})
-            tiff.build_overviews(_overviews(grid), Resampling.mode)
+            yield tiff
+            tiff.build_overviews(_overviews(grid), Resampling[resampling])
         # the driver for cloud-optimised files writes no blocks, it only puts those of another file in order
         with rasterio.MemoryFile() as ordered, replacing(path) as file:
             rasterio.shutil.copy(memory.name, ordered.name, driver="COG", compress="deflate", blocksize=BLOCK)
             file.write(ordered.getbuffer())
 
 
+def window_of(corner: tuple[int, int], shape: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
+    """Rows and columns of a block with this upper left pixel, as rasterio takes them."""
+    return tuple((start, start + length) for start, length in zip(corner, shape, strict=True))
+
+
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """The pixels of the GeoTIFF: upper left corner, m, size, and the height at which they are transformed."""
 
     cell_m: float
@@ -164,7 +184,7 @@ class _Grid:
     alt_m: float
 
     @classmethod
-    def over(cls, cells: _Cells, exported: Exported, georeference: Georeference) -> _Grid:
+    def over(cls, cells: Cells, exported: Exported, georeference: Georeference) -> Grid:
         """Pixels as wide as the cells, over all of these."""
         voxel_m = exported.map.voxel_size_m
         cell_m, height = cells.per_cell * voxel_m, exported.extent.mean[2] * voxel_m
@@ -177,43 +197,69 @@ class _Grid:
         return cls(cell_m, low[0] * cell_m, high[1] * cell_m, rows, columns, float(np.median(box[:, 2])))
 
 
-def _blocks(
-    exported: Exported, cells: _Cells, grid: _Grid, georeference: Georeference
-) -> Iterator[tuple[tuple[int, int], NDArray[np.uint8]]]:
-    """Row and column of the upper left pixel of every block of the GeoTIFF, and the block.
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """Corners of the blocks of the GeoTIFF: rows (i + 1,) and columns (j + 1,) of pixels, and where they are."""
 
-    The way back to the map frame is exact at the corners of the blocks and bilinear between them, which is wrong by
-    3 µm over 256 pixels of 0.2 m. It is taken at one height; a point dh above it is displaced by dh times its distance
-    over the Earth's radius: 2 cm for 20 m at 6 km.
-    """
-    rows = np.append(np.arange(0, grid.rows, BLOCK), grid.rows)
-    columns = np.append(np.arange(0, grid.columns, BLOCK), grid.columns)
-    v, u = np.meshgrid(rows, columns, indexing="ij")
-    corners = np.stack(
-        [grid.west + u * grid.cell_m, grid.north - v * grid.cell_m, np.full(u.shape, grid.alt_m)], -1
-    )
-    east, north, _ = np.moveaxis(georeference.to_map(corners), -1, 0)
-    # corners of the blocks, in cells from the view's upper left corner
-    corners = np.stack([cells.north - north / grid.cell_m, east / grid.cell_m - cells.west], axis=-1)
-    for i in range(0, len(rows) - 1, BLOCKS_AT_ONCE):
-        end = min(i + BLOCKS_AT_ONCE, len(rows) - 1)
-        first = max(0, int(corners[i : end + 1, :, 0].min()) - 1)
-        last = min(cells.rows, int(corners[i : end + 1, :, 0].max()) + 2)
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    places: NDArray[np.float64]
+    """(i + 1, j + 1, 2) in cells down and right of the view's upper left corner."""
+    lift_m: NDArray[np.float64]
+    """(i + 1, j + 1) what heights in the CRS are more than those in the map frame."""
+
+    @classmethod
+    def of(cls, cells: Cells, grid: Grid, georeference: Georeference) -> Corners:
+        """The way back to the map frame is exact at the corners of the blocks and bilinear between them, which is wrong
+        by 3 µm over 256 pixels of 0.2 m. It is taken at one height; a point dh above it is displaced by dh times its
+        distance over the Earth's radius: 2 cm for 20 m at 6 km.
+        """
+        rows = np.append(np.arange(0, grid.rows, BLOCK), grid.rows)
+        columns = np.append(np.arange(0, grid.columns, BLOCK), grid.columns)
+        v, u = np.meshgrid(rows, columns, indexing="ij")
+        corners = np.stack(
+            [grid.west + u * grid.cell_m, grid.north - v * grid.cell_m, np.full(u.shape, grid.alt_m)], -1
+        )
+        east, north, up = np.moveaxis(georeference.to_map(corners), -1, 0)
+        places = np.stack([cells.north - north / grid.cell_m, east / grid.cell_m - cells.west], axis=-1)
+        return cls(rows, columns, places, grid.alt_m - up)
+
+    def block(self, i: int, j: int) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Its upper left pixel, and its shape."""
+        corner = int(self.rows[i]), int(self.columns[j])
+        return corner, (int(self.rows[i + 1]) - corner[0], int(self.columns[j + 1]) - corner[1])
+
+
+def _blocks(
+    exported: Exported, cells: Cells, grid: Grid, georeference: Georeference
+) -> Iterator[tuple[tuple[int, int], NDArray[np.uint8]]]:
+    """Row and column of the upper left pixel of every block of the GeoTIFF, and the block."""
+    corners = Corners.of(cells, grid, georeference)
+    count, columns = (length - 1 for length in corners.lift_m.shape)
+    for i in range(0, count, BLOCKS_AT_ONCE):
+        end = min(i + BLOCKS_AT_ONCE, count)
+        first = max(0, int(corners.places[i : end + 1, :, 0].min()) - 1)
+        last = min(cells.rows, int(corners.places[i : end + 1, :, 0].max()) + 2)
         labels, _, _ = _seen_in_rows(exported, cells, first, last)
-        for k, j in np.ndindex(end - i, len(columns) - 1):
-            corner = int(rows[i + k]), int(columns[j])
-            shape = int(rows[i + k + 1]) - corner[0], int(columns[j + 1]) - corner[1]
-            yield corner, _resampled(labels, corners[i + k : i + k + 2, j : j + 2] - (first, 0), shape)
+        for k, j in np.ndindex(end - i, columns):
+            corner, shape = corners.block(i + k, j)
+            places = corners.places[i + k : i + k + 2, j : j + 2] - (first, 0)
+            yield corner, _resampled(labels, places, shape)
+
+
+def between(corners: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Values (*shape, k) at the pixels of a block, bilinear between those at its corners (2, 2, k)."""
+    down = ((np.arange(shape[0]) + 0.5) / shape[0])[:, None, None]
+    right = ((np.arange(shape[1]) + 0.5) / shape[1])[None, :, None]
+    upper, lower = ((1 - right) * edge[0] + right * edge[1] for edge in corners)
+    return np.asarray((1 - down) * upper + down * lower)
 
 
 def _resampled(
     labels: NDArray[np.int8], corners: NDArray[np.float64], shape: tuple[int, int]
 ) -> NDArray[np.uint8]:
     """One block: its corners (2, 2, 2) are places in the array of labels, in cells."""
-    down = ((np.arange(shape[0]) + 0.5) / shape[0])[:, None, None]
-    right = ((np.arange(shape[1]) + 0.5) / shape[1])[None, :, None]
-    upper, lower = ((1 - right) * edge[0] + right * edge[1] for edge in corners)
-    rows, columns = np.moveaxis(np.floor((1 - down) * upper + down * lower).astype(np.int64), -1, 0)
+    rows, columns = np.moveaxis(np.floor(between(corners, shape)).astype(np.int64), -1, 0)
     inside = (rows >= 0) & (rows < labels.shape[0]) & (columns >= 0) & (columns < labels.shape[1])
     block = np.full(shape, NOTHING, np.int16)
     block[inside] = labels[rows[inside], columns[inside]]
@@ -227,7 +273,7 @@ def _colour_table(label_set: LabelSet) -> dict[int, tuple[Any, ...]]:
     return {**table, GEOTIFF_UNLABELLED: (*UNLABELLED_COLOUR, 255), GEOTIFF_NODATA: (0, 0, 0, 0)}
 
 
-def _overviews(grid: _Grid) -> list[int]:
+def _overviews(grid: Grid) -> list[int]:
     """Factors of two until the whole raster fits one block."""
     count = int(np.ceil(np.log2(max(grid.rows, grid.columns) / BLOCK)))
     return [2**i for i in range(1, count + 1)]

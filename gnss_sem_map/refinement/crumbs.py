@@ -31,7 +31,7 @@ def apply(state: MapState, settings: CrumbSettings) -> MapState:
     if state.beside.moved is None:
         raise NotApplicable("moving objects were not sought")
     assert state.decided is not None
-    gone, over = state.is_removed, over_ground(state)
+    gone, over = state.is_removed, over_ground(state.voxels, state.heights)
     asked = over & ~gone & (state.voxels.hits <= settings.most_points)
     asked &= ~state.on_kerbs  # which are ground
     crumbs = more_goes_than_stands(state, asked, gone, over) | passed_over_ground(state, asked, gone, over)

@@ -56,7 +56,7 @@ def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
     removed = traversed(state.voxels, state.beside.keyframes, settings)
     removed &= ~state.on_kerbs  # which are ground
     # rays graze the edges of roofs
-    free = more_goes_than_stands(state, removed, removed, over_ground(state))
+    free = more_goes_than_stands(state, removed, removed, over_ground(state.voxels, state.heights))
     return state.without(free, Reason.FREE_SPACE)
 
 

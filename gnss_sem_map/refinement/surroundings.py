@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.refinement.state import MapState
 from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 COLUMNS_AROUND = np.array(
     [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) for x in (-1, 0, 1) for y in (-1, 0, 1)], np.int64
@@ -23,14 +24,13 @@ STEP_M = 0.025
 steeper than 1 in 4: rays meet the ground so flat that the noise of ranges hardly changes its height."""
 
 
-def over_ground(state: MapState) -> NDArray[np.bool_]:
-    """Which voxels (v,) are over the ground, and no part of it."""
-    voxels = state.voxels
+def over_ground(voxels: VoxelMap, heights: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which voxels (v,) are over the ground, and no part of it; `heights` (v,) m are those of `height_over_ground`."""
     inside = voxels.surface_heights - voxels.indices[:, 2] * voxels.voxel_size_m
     has_under = np.append(False, np.diff(voxels.keys) == 1)[: len(voxels)]
     step = np.diff(inside, prepend=0.0) + voxels.voxel_size_m
     on_ground = has_under & ((inside > INSIDE_M) | (step > STEP_M))
-    return np.asarray((state.heights > OVER_M) | on_ground)
+    return np.asarray((heights > OVER_M) | on_ground)
 
 
 def more_goes_than_stands(

@@ -37,8 +37,10 @@ from gnss_sem_map.export.trajectories import (
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
+from gnss_sem_map.files.untrusted import is_folder
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.labels.roles import MOVABLE
+from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
 from gnss_sem_map.preflight.findings import Preflight
@@ -211,7 +213,11 @@ def exported_of(
     """What is exported of a run folder; without `label_set`, the classes are those that its map names."""
     refined = tiles.open_map(folder / REFINED, label_set, with_sums=False)
     refined = sure_part(refined, delivery.min_confidence)
-    return Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid, open_attributes(folder))
+    raw = tiles.open_map(folder / MAP, refined.label_set, with_sums=False) if is_folder(folder / MAP) else None
+    return Exported(
+        refined, tracks, title, changes, delivery.crs, delivery.geoid, open_attributes(folder), raw,
+        delivery.nav2, delivery.terrain,
+    )  # fmt: skip
 
 
 def georeference_of(settings: Settings, frame: LocalFrame | None) -> Georeference | None:

@@ -241,7 +241,8 @@ def joined_voxels(parts: Sequence[VoxelMap], voxel_size_m: float, label_set: Lab
     """The voxels of parts that share none."""
     keys = np.concatenate([np.empty(0, np.int64), *(part.keys for part in parts)])
     order = np.argsort(keys, kind="stable")  # quick: the keys of each part are sorted
-    evidence = np.empty((len(keys), len(label_set.names)), np.int32)
+    sums = len(label_set.names) if not parts else parts[0].evidence.shape[1]  # none, where they were not read
+    evidence = np.empty((len(keys), sums), np.int32)
     rows = np.empty(len(keys), np.int64)
     rows[order] = np.arange(len(keys))
     for part, of_part in zip(parts, np.split(rows, np.cumsum([len(part) for part in parts])), strict=False):

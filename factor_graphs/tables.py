@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
+from factor_graphs.table_dates import GPS_TIME, ZONE
 
 HEADER_BYTES, HEADER_LINES, MAGIC_BYTES = 100_000, 100, 64
 MOST_COLUMNS, LONGEST_NAME = 1000, 200
@@ -127,6 +128,8 @@ class Layout:
     rows: memoryview
     separator: str = ","
     decimal: str = "."
+    above: str = ""
+    """What stands above the names."""
 
     @cached_property
     def _plain(self) -> list[list[tuple[str, str | None]]]:
@@ -192,6 +195,10 @@ class Layout:
         cells = (row[at].strip().strip('"') for row in self._head if at < len(row))
         return next((cell for cell in cells if cell), "")
 
+    def is_of_gps_time(self, at: int) -> bool:
+        """Whether the name of a column of dates, or what stands above the names, says that they are of GPS time."""
+        return bool(GPS_TIME.search(f"{self.header[at]}\n{self.above}")) and not ZONE.search(self.first(at))
+
     def missing(self, name: str, expected: Collection[str]) -> str:
         """Why a column is not there, and what to do."""
         if all(NUMBER_CELL.match(cell) for cell in self.header if cell):
@@ -214,7 +221,7 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
         )
     lines = _decoded(content[:HEADER_BYTES]).split("\n")[:HEADER_LINES]
     at = _header_line(lines, wanted, most)
-    header, header_separator = _split(COMMENT.sub("", lines[at]))
+    above, (header, header_separator) = "\n".join(lines[:at]), _split(COMMENT.sub("", lines[at]))
     rest = [k for k in range(at + 1, len(lines)) if lines[k].strip() and not COMMENT.match(lines[k])]
     if rest and _are_units(lines[rest[0]]):
         header, at, rest = _with_units(lines[at], header, lines[rest[0]]), rest[0], rest[1:]
@@ -228,7 +235,7 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
     if separator == " ":
         by_tabs = b"\n".join(b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
         rows, separator = memoryview(by_tabs), "\t"
-    return Layout([*header, ""] if is_ended else header, rows, separator, decimal)
+    return Layout([*header, ""] if is_ended else header, rows, separator, decimal, above)
 
 
 def as_utf8(content: bytes) -> bytes:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ NO_POINTS, EVERY = 0.1, 8
 out of bounds. Every eighth point is tested."""
 LARGEST_NUMBER = 2**63 - 1
 
+T = TypeVar("T")
 State = tuple[int, int]
 """Size in bytes and time of the last change, ns, of a file."""
 
@@ -35,8 +37,29 @@ State = tuple[int, int]
 class Frames:
     """The files of a folder by frame number, in order, and the skipped ones."""
 
+    what: str
+    folder: Path
     files: dict[int, Path]
     skips: list[Skip]
+
+    def joined(
+        self, stamps: Mapping[int, T], why: str = "no stamp for this frame"
+    ) -> tuple[list[tuple[int, Path, T]], list[Skip]]:
+        """Number, file and stamp of the frames that have both; a skip for each other file, and run of other stamps."""
+        skips = [Skip(self.what, shown(path), why) for n, path in self.files.items() if n not in stamps]
+        skips += self.skips + self.missing(stamps)
+        return [(n, path, stamps[n]) for n, path in self.files.items() if n in stamps], skips
+
+    def missing(self, known: Iterable[int]) -> list[Skip]:
+        """One skip for every run of known frames without a file."""
+        folder = self.folder.parent if self.folder.name == "data" else self.folder
+        absent = sorted(set(known) - set(self.files))
+        breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
+        runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
+        return [
+            Skip(self.what, f"{shown(folder)}: frames {a[0]} to {a[-1]}", f"{len(a)} files missing", len(a))
+            for a in runs
+        ]
 
 
 def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
@@ -46,7 +69,7 @@ def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
     folder that cannot be listed.
     """
     if not is_folder(folder):
-        return Frames({}, [])
+        return Frames(what, folder, {}, [])
     of_kind = [path for path in inside(folder) if path.suffix.lower() in suffixes and path.stem.isdecimal()]
     files: dict[int, Path] = {}
     skips = []
@@ -58,7 +81,7 @@ def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
             skips.append(Skip(what, shown(path), f"frame {number} has another file, {files[number].name}"))
         else:
             files[number] = path
-    return Frames(dict(sorted(files.items())), skips)
+    return Frames(what, folder, dict(sorted(files.items())), skips)
 
 
 def state_of(path: Path) -> State | None:
@@ -123,7 +146,7 @@ def first_size(files: Iterable[Path]) -> tuple[int, int] | None:
     """(width, height) of the first image that can be read."""
     for path in files:
         try:
-            height, width = read_image(path, None).shape[:2]
+            height, width = read_picture(path).shape[:2]
         except DataError:
             continue
         return width, height
@@ -148,19 +171,3 @@ def scale_intensity(rows: NDArray[np.float32], intensity_max: float) -> None:
         with np.errstate(over="ignore", invalid="ignore"):  # of damaged points
             rows[:, 3] = rows[:, 3] / np.float64(intensity_max)
     np.copyto(rows[:, 3], 0.0, where=np.isnan(rows[:, 3]))
-
-
-def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """RGB pixels (h, w, 3); raises DataError for a damaged file or another (width, height) than the calibration's."""
-    return read_picture(path, size)
-
-
-def missing(what: str, folder: Path, known: Iterable[int], files: dict[int, Path]) -> list[Skip]:
-    """One skip for every run of known frames without a file."""
-    absent = sorted(set(known) - set(files))
-    breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
-    runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
-    return [
-        Skip(what, f"{shown(folder)}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing", len(run))
-        for run in runs
-    ]

@@ -21,7 +21,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.given_poses import do_fit, misses, pose_by_fixes, turns_seen
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets.gnss_files import sbet
-from gnss_sem_map.datasets.kitti_odometry import read_table
+from gnss_sem_map.datasets.kitti_calibration import read_table
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.untrusted import is_file, shown

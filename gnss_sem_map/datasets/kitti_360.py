@@ -17,7 +17,6 @@ trajectory.
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import frames, kitti_calibration, kitti_oxts, kitti_raw, kitti_stamps
-from gnss_sem_map.datasets.kitti_odometry import read_table
+from gnss_sem_map.datasets.kitti_calibration import read_table
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import MOST_YAML_BYTES, fault_of, parse_yaml
@@ -131,19 +130,11 @@ def _root(drive: Path) -> Path:
 
 
 def _scans(folder: Path, stamps_ns: dict[int, int], epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
-    found = frames.numbered("scan", folder / "data", ".bin")
-    skips = found.skips + frames.missing("scan", folder, stamps_ns, found.files)
+    found, skips = frames.numbered("scan", folder / "data", ".bin").joined(stamps_ns)
     steps = np.diff(sorted(stamps_ns.values())) * 1e-9
     half = 0.5 * (float(np.median(steps)) if len(steps) else USUAL_SWEEP_S)
-    scans = []
-    for number, path in found.files.items():
-        if number not in stamps_ns:
-            skips.append(Skip("scan", shown(path), "no stamp for this frame"))
-            continue
-        stamp = (stamps_ns[number] - epoch_ns) * 1e-9
-        sweep = (stamp - half, stamp + half)
-        read_it = partial(kitti_raw.read_sweep, path, stamp, *sweep, frames.state_of(path))
-        scans.append(Scan(path.stem, number, stamp, read_it, sweep))
+    timed = ((n, path, (ns - epoch_ns) * 1e-9) for n, path, ns in found)
+    scans = [kitti_raw.scan_of(path, n, stamp, stamp - half, stamp + half) for n, path, stamp in timed]
     return in_order("scan", scans, skips), skips
 
 
@@ -154,9 +145,7 @@ def _images(
     skips: list[Skip] = []
     for name, camera in zip(names, calibration.cameras, strict=True):
         found = frames.numbered("image", folder / name / IMAGES[name], *frames.IMAGE_SUFFIXES)
-        of_camera, lost = kitti_raw.stamped_images(
-            found, folder / name, epoch_ns, camera.image_size, camera.name, of_scans
-        )
+        of_camera, lost = kitti_raw.stamped_images(found, epoch_ns, camera.image_size, camera.name, of_scans)
         images += of_camera
         skips += lost
     return tuple(sorted(images, key=lambda image: image.stamp)), skips
@@ -164,9 +153,8 @@ def _images(
 
 def _calibration(folder: Path, names: list[str]) -> Calibration:
     """Pose of the LiDAR, and the cameras of these names; an only one has none."""
-    file = folder / "calib_cam_to_pose.txt"
-    rows = kitti_calibration.read_rows(file, dict.fromkeys(IMAGES, 12))
-    T_pose_camera = {name: _rigid(row, f"{shown(file)}: {name}") for name, row in rows.items()}
+    to_pose = kitti_calibration.CalibrationFile(folder / "calib_cam_to_pose.txt", dict.fromkeys(IMAGES, 12))
+    T_pose_camera = {name: kitti_calibration.exact(to_pose.pose(name)) for name in IMAGES}
     file = folder / "calib_cam_to_velo.txt"
     T_lidar_camera0 = _rigid(read_table(file, 12)[0], shown(file))
     T_imu_lidar = T_IMU_POSE @ T_pose_camera["image_00"] @ np.linalg.inv(T_lidar_camera0)
@@ -184,23 +172,15 @@ def _calibration(folder: Path, names: list[str]) -> Calibration:
 
 
 def _rigid(row: Array, where: str) -> Array:
-    """A (4, 4) transform from twelve numbers, row by row."""
-    T = row.reshape(3, 4)
-    return kitti_calibration.exact(kitti_calibration.transform(T[:, :3], T[:, 3], where))
+    return kitti_calibration.exact(kitti_calibration.transform(row, where))
 
 
 def _rectified(file: Path, number: str) -> tuple[Array, Array, tuple[int, int]]:
     """The rotation (4, 4) that rectifies a camera, K, and (width, height)."""
-    rows = kitti_calibration.read_rows(
-        file, {f"R_rect_{number}": 9, f"P_rect_{number}": 12, f"S_rect_{number}": 2}
-    )
-    R_rect = kitti_calibration.transform(
-        rows[f"R_rect_{number}"], np.zeros(3), f"{shown(file)}: R_rect_{number}"
-    )
+    R, P, S = (f"{name}_rect_{number}" for name in "RPS")
+    about = kitti_calibration.CalibrationFile(file, {R: 9, P: 12, S: 2})
     # the shift in P is that between the two cameras, which their poses have already
-    K, _ = kitti_calibration.split_projection(rows[f"P_rect_{number}"], f"{shown(file)}: P_rect_{number}")
-    size = kitti_calibration.image_size(rows[f"S_rect_{number}"], f"{shown(file)}: S_rect_{number}")
-    return kitti_calibration.exact(R_rect), K, size
+    return kitti_calibration.exact(about.pose(R)), about.projection(P)[0], about.size(S)
 
 
 def _fisheye(file: Path) -> tuple[Array, tuple[int, int], Distortion]:

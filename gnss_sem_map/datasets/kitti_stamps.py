@@ -9,7 +9,7 @@ import numpy as np
 
 from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_file, read_lines, shown
+from gnss_sem_map.files.untrusted import expect_file, read_lines, shown
 from gnss_sem_map.sensor_log import Skip
 
 STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
@@ -20,8 +20,7 @@ def stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
 
     Stamps of impossible years are skipped, and those in a leap second, which Unix time does not have.
     """
-    if not is_file(path):
-        raise DataError(f"{shown(path)}: missing stamps; expected one line `date time` per frame")
+    expect_file(path, "stamps, one line `date time` per frame")
     stamps, skips = {}, []
     for number, line in enumerate(read_lines(path)):
         text = line.strip()

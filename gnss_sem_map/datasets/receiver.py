@@ -11,7 +11,7 @@ from factor_graphs.csv_log import NOT_DEFINITE
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities
 from factor_graphs.receiver_rows import fixes_of, headings_of, velocities_of
-from gnss_sem_map.sensor_log import Skip
+from gnss_sem_map.sensor_log import Skip, repaired
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +40,7 @@ def measured(
     gnss, gnss_repairs, no_covariance = fixes_of(rows, frame)
     velocities, velocity_repairs = velocities_of(rows if velocity is None else velocity, frame)
     headings, heading_repairs = headings_of(rows if heading is None else heading, frame, baseline)
-    skips = [
-        Skip("samples", where, str(repairs))
-        for repairs in (gnss_repairs, velocity_repairs, heading_repairs)
-        if repairs is not None and repairs.dropped
-    ]
+    skips = repaired(where, gnss_repairs, velocity_repairs, heading_repairs)
     if no_covariance:
         skips.append(Skip("covariance", where, f"{no_covariance} fixes: {NOT_DEFINITE}", no_covariance))
     return Receiver(frame, gnss, velocities, headings), skips

@@ -57,6 +57,12 @@ def is_file(path: Path, error: type[SemMapError] = DataError) -> bool:
     return found is not None
 
 
+def expect_file(path: Path, expected: str) -> None:
+    """Raise DataError, with what is expected there, unless the path is a file."""
+    if not is_file(path):
+        raise DataError(f"{shown(path)}: missing; expected {expected}")
+
+
 def is_folder(path: Path, error: type[SemMapError] = DataError) -> bool:
     """Whether the path is a folder; raises `error` if that cannot be read, or if it is something else."""
     found = status(path, error)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import bisect
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -26,12 +26,14 @@ from factor_graphs.measurements import (
     GnssVelocities,
     ImuNoise,
     ImuSamples,
+    Repairs,
     WheelSpeeds,
 )
 from factor_graphs.settings import SampleInstant
 from factor_graphs.surveyed_points import SurveyedPoints
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.sensor_log.cameras import NAME, Camera, is_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -176,6 +178,16 @@ class Skip:
     reason: str
     frames: int = 1
     """Number of frames, rows or files."""
+
+
+def skipped(what: str, where: object, noun: str, counts: Mapping[str, int]) -> list[Skip]:
+    """A skip for every reason, of so many things."""
+    return [Skip(what, shown(where), f"{n} {noun}: {why}", n) for why, n in counts.items()]
+
+
+def repaired(where: object, *repairs: Repairs | None) -> list[Skip]:
+    """A skip for every sensor of whose rows some were dropped."""
+    return [Skip("samples", shown(where), str(one)) for one in repairs if one is not None and one.dropped]
 
 
 SENSOR = "sensor"

@@ -119,9 +119,7 @@ def _content(path: Path, expected: str) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise MeasurementError(
-            f"{path}: cannot be read ({error.strerror}); expected a table {expected}"
-        ) from None
+        raise MeasurementError(f"{path}: cannot be read ({error.strerror}); expected {expected}") from None
 
 
 def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:
@@ -131,7 +129,7 @@ def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:
     are there, stamp_s and std_e_m, std_n_m, std_u_m. Heights are above the ellipsoid. Raises MeasurementError as
     `surveyed_points.to_points` does, and for a row that is damaged.
     """
-    return parse_points(_content(Path(path), "of points"), frame, str(path))
+    return parse_points(_content(Path(path), "a table of points"), frame, str(path))
 
 
 def parse_points(content: bytes, frame: LocalFrame, where: str) -> SurveyedPoints:
@@ -204,9 +202,7 @@ def parse_numbers(
         if name in table.column_names:
             rows[:, k] = table[name].to_numpy()
     if fault := unit_fault(rows[:, 0], longest_step_s):
-        raise MeasurementError(
-            f"{where}: {fault}; the name of the column may say so: stamp_ms, stamp_us, stamp_ns"
-        )
+        raise MeasurementError(f"{where}: {fault}; the column may be named so: stamp_ms, stamp_us, stamp_ns")
     return rows
 
 
@@ -369,5 +365,5 @@ def _numbers(
 ) -> tuple[Array, list[str]]:
     """The rows of a file, and what is to be told of its stamps."""
     told: list[str] = []
-    content = _content(path, f"with columns {','.join(columns)}")
+    content = _content(path, f"a table with columns {','.join(columns)}")
     return parse_numbers(content, columns, str(path), longest_step_s, more, told=told), told

@@ -62,9 +62,7 @@ class _Rows:
         stddevs = getattr(self, "stddevs", np.ones(1))
         if np.any(stddevs <= 0):
             row = int(np.argwhere(stddevs <= 0)[0, 0])
-            raise MeasurementError(
-                f"{what}.stddevs[{row}] is {stddevs[row]} {self._unit}; expected positive values"
-            )
+            raise MeasurementError(f"{what}.stddevs[{row}] is {stddevs[row]} {self._unit}; expected positive")
 
     def _check(self, name: str, array: Array | None) -> None:
         n = len(self.stamps) if self.stamps.ndim == 1 else -1
@@ -74,9 +72,7 @@ class _Rows:
             raise MeasurementError(f"{what} has shape {array.shape}; expected {expected}")
         if array is not None and not np.isfinite(array).all():
             row = int(np.argwhere(~np.isfinite(array))[0, 0])
-            raise MeasurementError(
-                f"{what}[{row}] is not finite; drop such rows with clean_imu/clean_gnss/clean_wheels"
-            )
+            raise MeasurementError(f"{what}[{row}] is not finite; drop such rows with clean_imu, clean_gnss")
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -179,8 +179,7 @@ class Layout:
                 yield Column(k, units.get(str(unit), 1.0), True)
             elif at_end == "" and plain + str(unit) not in WORDS:
                 raise MeasurementError(
-                    f"column {self.header[k][:50]!r} is in a unit that is not known; expected one of"
-                    f" {', '.join(units)}; without one, it is in the first"
+                    f"column {self.header[k][:50]!r} has an unknown unit; expected one of {', '.join(units)}"
                 )
             elif at_end in units:
                 yield Column(k, units[at_end], True)
@@ -216,9 +215,7 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
     """How a table is written that has `wanted` columns, and perhaps some of `most`; of another, by its first line."""
     content = as_utf8(content)
     if b"\0" in content[:MAGIC_BYTES]:
-        raise MeasurementError(
-            "is no text (a spreadsheet, an archive, or another binary file); save it as CSV in UTF-8"
-        )
+        raise MeasurementError("is no text (a spreadsheet, an archive or the like); save it as CSV in UTF-8")
     lines = _decoded(content[:HEADER_BYTES]).split("\n")[:HEADER_LINES]
     at = _header_line(lines, wanted, most)
     above, (header, header_separator) = "\n".join(lines[:at]), _split(COMMENT.sub("", lines[at]))

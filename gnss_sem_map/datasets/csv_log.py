@@ -54,7 +54,7 @@ from gnss_sem_map.datasets.receiver import Receiver, measured
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
 from gnss_sem_map.errors import DataError, errors_of_measurements
 from gnss_sem_map.files.pictures import read_picture
-from gnss_sem_map.files.untrusted import expect_file, inside, is_file, is_folder, read_bytes, shown
+from gnss_sem_map.files.untrusted import expect_file, inside, is_file, is_folder, read_bytes, refused, shown
 from gnss_sem_map.sensor_log import (
     POSE_OF_LIDAR,
     SENSOR,
@@ -162,7 +162,7 @@ def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Ar
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
     path, file = drive / "gnss.csv", about.gnss_file
     if file is not None and is_file(path) and file.path != path.name:
-        raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
+        raise refused(path, "there is a gnss_file in log.yaml as well; remove one of the two")
     if file is None and not _is_of_our_columns(path):
         file = GnssFile(path=path.name)
     if file is None:
@@ -222,9 +222,7 @@ def _numbers(
             column = layout_of(content, columns).column(name)
         if column is not None and column.scale != 1.0 and getattr(about, UNIT_KEYS[name]) is not None:
             key = UNIT_KEYS[name]
-            raise DataError(
-                f"{where}: the unit of {name} is in its header, and {key} in log.yaml; remove {key}"
-            )
+            raise refused(where, f"the unit of {name} is in its header, and {key} in log.yaml; remove {key}")
     rows = parse_numbers(content, columns, where, longest_step_s, more, about.epoch_ns, told)
     return rows, [Skip("unit", where, text, len(rows)) for text in told]
 
@@ -257,7 +255,7 @@ def _stamps(path: Path, what: str, epoch_ns: int) -> tuple[dict[int, float], lis
         else:
             stamps[number] = stamp
     if not stamps:
-        raise DataError(f"{shown(path)}: found no whole number with a stamp among {len(texts)} rows")
+        raise refused(path, f"found no whole number with a stamp among {len(texts)} rows")
     return stamps, skips
 
 
@@ -329,10 +327,11 @@ def _check_columns(rows: NDArray[np.float32], where: str) -> None:
     """Raise DataError for numbers in rows of another length: coordinates fall into the column of intensities."""
     negative = float((rows[:, 3] < 0).mean())
     if negative > MOST_NEGATIVE:
-        raise DataError(
-            f"{where}: {negative:.0%} of the intensities are below zero: are these rows of another count of columns?"
+        raise refused(
+            where,
+            f"{negative:.0%} of the intensities are below zero: are these rows of another count of columns?"
             f" expected {rows.shape[1]}, x y z intensity{'' if rows.shape[1] == 4 else ' time'}; lidar_is_compensated"
-            " in log.yaml (is_compensated in lidars) says whether there are times"
+            " in log.yaml (is_compensated in lidars) says whether there are times",
         )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.pictures import read_picture
-from gnss_sem_map.files.untrusted import inside, is_folder, open_file, reason, shown, status
+from gnss_sem_map.files.untrusted import inside, is_folder, open_file, reason, refused, shown, status
 from gnss_sem_map.sensor_log import Skip
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -102,24 +102,20 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
         found = os.fstat(file.fileno())
         size = found.st_size
         if state is not None and state != (size, found.st_mtime_ns):
-            raise DataError(
-                f"{shown(path)}: changed while the drive was read; found {size} bytes, once {state[0]}"
-            )
+            raise refused(path, f"changed while the drive was read; found {size} bytes, once {state[0]}")
         if size > 4 * columns * MOST_POINTS:
-            raise DataError(
-                f"{shown(path)}: found {size} bytes, more than {MOST_POINTS} points; is it a scan?"
-            )
+            raise refused(path, f"found {size} bytes, more than {MOST_POINTS} points; is it a scan?")
         try:
             if path.suffix.lower() == ".txt":
                 return _rows_of_text(file.readall(), columns, path)
             rows = np.empty((size // (4 * columns), columns), "<f4")
             if size == 0 or size != rows.nbytes or file.readinto(rows.data) != size:
-                raise DataError(
-                    f"{shown(path)}: truncated scan, or another count of columns; found {size} bytes, expected a"
-                    f" multiple of {4 * columns} ({columns} columns) and more than 0"
+                raise refused(
+                    path,
+                    f"truncated scan; found {size} bytes, expected {columns} columns of 4 bytes",
                 )
         except OSError as error:
-            raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None
+            raise refused(path, f"cannot read it ({reason(error)})") from None
     refuse_other_bytes(rows, shown(path))
     return rows
 
@@ -131,13 +127,9 @@ def _rows_of_text(content: bytes, columns: int, path: Path) -> NDArray[np.float3
             np.loadtxt(lines, np.float32, comments=None, ndmin=2) if lines else np.empty((0, 0), np.float32)
         )
     except ValueError as error:
-        raise DataError(
-            f"{shown(path)}: no rows of {columns} numbers ({' '.join(str(error).split())[:100]})"
-        ) from None
+        raise refused(path, f"no rows of {columns} numbers ({' '.join(str(error).split())[:100]})") from None
     if rows.shape[1] != columns:
-        raise DataError(
-            f"{shown(path)}: found {rows.shape[1]} numbers per line, expected {columns}; is it truncated?"
-        )
+        raise refused(path, f"found {rows.shape[1]} numbers per line, expected {columns}; is it truncated?")
     refuse_other_bytes(rows, shown(path))
     return rows
 
@@ -159,9 +151,9 @@ def refuse_other_bytes(rows: NDArray[np.float32], where: str) -> None:
     out = ((sizes > FARTHEST_M) & np.isfinite(sizes)) | ((sizes < NEAREST_M) & (sizes > 0))
     share = float(out.any(axis=0).mean())
     if share > NO_POINTS:
-        raise DataError(
-            f"{where}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within"
-            f" {NEAREST_M:g} m of zero, expected metres; are these other bytes, another count of columns, or mm?"
+        raise refused(
+            where,
+            f"no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m, or in zero; other columns, or mm?",
         )
 
 

@@ -28,9 +28,8 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import frames, kitti_calibration, kitti_oxts, kitti_raw, kitti_stamps
 from gnss_sem_map.datasets.kitti_calibration import read_table
 from gnss_sem_map.datasets.stamps import in_order
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import MOST_YAML_BYTES, fault_of, parse_yaml
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, shown
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, refused, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
 
@@ -92,7 +91,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     about, poses = root / "calibration", root / "data_poses" / name
     stamps_ns, skips = kitti_stamps.stamps_ns(drive / "velodyne_points" / "timestamps.txt")
     if not stamps_ns:
-        raise DataError(f"{shown(drive / 'velodyne_points' / 'timestamps.txt')}: found no stamp")
+        raise refused(drive / "velodyne_points" / "timestamps.txt", "found no stamp")
     unit = None
     if is_folder(poses / "oxts"):
         twin = name.replace("_sync", "_extract")
@@ -103,7 +102,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     epoch_ns = unit.epoch_ns if unit else min(stamps_ns.values())
     frame, track = _poses(poses / "poses.txt", stamps_ns, epoch_ns, unit.frame if unit else None)
     if unit is None and track is None:
-        raise DataError(f"{shown(poses)}: found neither oxts nor poses.txt; expected one of them")
+        raise refused(poses, "found neither oxts nor poses.txt; expected one of them")
     scans, scan_skips = _scans(drive / "velodyne_points", stamps_ns, epoch_ns)
     names = [camera for camera in IMAGES if is_folder(root / "data_2d_raw" / name / camera / IMAGES[camera])]
     calibration = _calibration(about, names)
@@ -186,7 +185,7 @@ def _rectified(file: Path, number: str) -> tuple[Array, Array, tuple[int, int]]:
 def _fisheye(file: Path) -> tuple[Array, tuple[int, int], Distortion]:
     """K, (width, height) and lens of a fisheye, from a file as OpenCV writes it."""
     if not is_file(file):
-        raise DataError(f"{shown(file)}: missing calibration file; its images are there")
+        raise refused(file, "missing calibration file; its images are there")
     text = re.sub(r"^%YAML[^\n]*\n", "", read_text(file, MOST_YAML_BYTES))
     try:
         about = FisheyeFile.model_validate(parse_yaml(re.sub(r":(?=[^\s])", ": ", text)))
@@ -194,9 +193,9 @@ def _fisheye(file: Path) -> tuple[Array, tuple[int, int], Distortion]:
         coefficients = (bent.k1, bent.k2, bent.p1, bent.p2)
         lens = Distortion(model="mei", coefficients=coefficients, xi=about.mirror_parameters.xi)
     except ValidationError as error:
-        raise DataError(f"{shown(file)}: {fault_of(error)}; expected the model of Mei") from None
+        raise refused(file, f"{fault_of(error)}; expected the model of Mei") from None
     except ValueError as error:
-        raise DataError(f"{shown(file)}: not YAML ({error})") from None
+        raise refused(file, f"not YAML ({error})") from None
     K = np.array([[projected.gamma1, 0, projected.u0], [0, projected.gamma2, projected.v0], [0, 0, 1.0]])
     return K, (about.image_width, about.image_height), lens
 
@@ -211,9 +210,9 @@ def _poses(
     rows = rows[np.isin(rows[:, 0], list(stamps_ns))]
     stamps = np.array([(stamps_ns[int(number)] - epoch_ns) * 1e-9 for number in rows[:, 0]])
     if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
-        raise DataError(
-            f"{shown(file)}: found {len(stamps)} poses of frames with a stamp, expected at least 2, in the order of"
-            " their frames"
+        raise refused(
+            file,
+            f"found {len(stamps)} poses of frames with a stamp, expected 2 or more in order",
         )
     T_world_pose = np.stack([_rigid(row, f"{shown(file)}: frame {row[0]:g}") for row in rows[:, 1:]])
     places = world_to_geodetic(T_world_pose[:, :3, 3])

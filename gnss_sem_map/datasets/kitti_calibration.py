@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import expect_file, is_file, read_bytes, read_lines, shown
+from gnss_sem_map.files.untrusted import expect_file, is_file, read_bytes, read_lines, refused, shown
 from gnss_sem_map.sensor_log.cameras import is_rigid
 
 Array = NDArray[np.float64]
@@ -30,17 +30,15 @@ class CalibrationFile:
 
     def __init__(self, path: Path, expected: dict[str, int]) -> None:
         if not is_file(path):
-            raise DataError(
-                f"{shown(path)}: missing calibration file; expected rows {sorted(expected)}."
-                " It comes with the drive's date (KITTI raw: *_calib.zip) or the data set (KITTI-360: calibration.zip)"
+            raise refused(
+                path,
+                f"missing calibration file; expected rows {sorted(expected)}; *_calib.zip of the date has it",
             )
         read_bytes(path, MOST_BYTES)
         try:
             rows = _pykitti_utils().read_calib_file(str(path))
         except (ValueError, IndexError, OSError):
-            raise DataError(
-                f"{shown(path)}: not a calibration file; expected lines `name: numbers`"
-            ) from None
+            raise refused(path, "not a calibration file; expected lines `name: numbers`") from None
         self._path, self.rows = path, dict[str, Array]()
         for name, count in expected.items():
             row = np.asarray(rows.get(name, ()), np.float64)
@@ -65,8 +63,8 @@ class CalibrationFile:
         K, below = P[:, :3].copy(), np.array([P[1, 0], P[2, 0], P[2, 1]])
         if min(K[0, 0], K[1, 1]) < 1e-3 or np.abs(below).max() > 1e-6 or abs(K[2, 2] - 1) > 1e-6:
             raise DataError(
-                f"{self._where(name)}: found {np.array2string(K, precision=4).replace(chr(10), '')}, expected the"
-                " camera matrix of a rectified camera: focal lengths above 0, and 0 0 1 in the last row"
+                f"{self._where(name)}: found {np.array2string(K, precision=4).replace(chr(10), '')}, expected that of"
+                " a rectified camera: focal lengths above 0, and 0 0 1 in the last row"
             )
         T[:3, 3] = np.linalg.solve(K, P[:, 3])
         if not np.isfinite(T).all() or np.abs(T).max() > LARGEST:
@@ -78,9 +76,7 @@ class CalibrationFile:
         """(width, height), px, of a row of two whole numbers that can be a picture's."""
         size = self.rows[name]
         if not ((size >= 1) & (size <= LARGEST_SIDE_PX) & (size == np.floor(size))).all():
-            raise DataError(
-                f"{self._where(name)}: found {size.tolist()}, expected width and height of the images, px"
-            )
+            raise DataError(f"{self._where(name)}: found {size.tolist()}, expected width and height, px")
         return int(size[0]), int(size[1])
 
 
@@ -99,8 +95,9 @@ def transform(numbers: Array, where: str) -> Array:
     """A (4, 4) transform from twelve numbers, row by row; raises DataError for no rotation."""
     T = np.vstack([numbers.reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
     if not is_rigid(T):
-        raise DataError(
-            f"{where}: {rotation_fault(T[:3, :3])}, expected a rotation to 1e-3 in a rigid transform; check the file"
+        raise refused(
+            where,
+            f"{rotation_fault(T[:3, :3])}, expected a rotation to 1e-3; check the file",
         )
     return T
 
@@ -143,10 +140,8 @@ def read_table(path: Path, columns: int) -> Array:
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
-            raise DataError(
-                f"{shown(path)}: line {number}: found {line[:40]!r}, expected {columns} finite numbers"
-            )
+            raise refused(path, f"line {number}: found {line[:40]!r}, expected {columns} finite numbers")
         rows.append(row)
     if not rows:
-        raise DataError(f"{shown(path)}: empty; expected {expected}")
+        raise refused(path, f"empty; expected {expected}")
     return np.array(rows)

@@ -17,9 +17,8 @@ from factor_graphs.stamps import far_off
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import frames, kitti_calibration
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.pictures import read_picture
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, shown
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, refused, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
 from gnss_sem_map.sensor_log.cameras import Camera
 
@@ -51,9 +50,9 @@ def read(sequence: Path, with_imu: bool = True) -> SensorLog:
     times = _times(sequence / "times.txt")
     poses = _poses(_poses_file(sequence))
     if len(times) != len(poses):
-        raise DataError(
-            f"{shown(sequence)}: found {len(poses)} poses and {len(times)} times, expected as many;"
-            " are poses.txt and times.txt of the same sequence?"
+        raise refused(
+            sequence,
+            f"found {len(poses)} poses and {len(times)} times, expected as many; of one sequence?",
         )
     stamps, why = dict(enumerate(times.tolist())), "no pose for this frame"
     scans = frames.numbered("scan", sequence / "velodyne", ".bin")
@@ -84,9 +83,9 @@ def _poses_file(sequence: Path) -> Path:
     own = sequence / "poses.txt"
     if is_file(own) or is_file(beside):
         return own if is_file(own) else beside
-    raise DataError(
-        f"{shown(own)}: missing, and so is {shown(beside)}; expected one line of 12 numbers per frame; of a sequence"
-        " without poses, map the raw drive that it is from"
+    raise refused(
+        own,
+        f"missing, and so is {shown(beside)}; expected 12 numbers a line; or map its raw drive",
     )
 
 
@@ -96,16 +95,16 @@ def _times(path: Path) -> Array:
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
         line = int(backwards[0]) + 2
-        raise DataError(
-            f"{shown(path)}: line {line}: found {times[line - 1]:.9g} after {times[line - 2]:.9g}, expected times that"
-            " increase"
+        raise refused(
+            path,
+            f"line {line}: {times[line - 1]:.9g} after {times[line - 2]:.9g}, expected rising",
         )
     check_unit(times, LONGEST_FRAME_STEP_S, shown(path))
     off = np.flatnonzero(far_off(times))
     if len(off):
-        raise DataError(
-            f"{shown(path)}: line {off[0] + 1}: found {times[off[0]]:.9g} s, far off all others; expected the times of"
-            " consecutive frames"
+        raise refused(
+            path,
+            f"line {off[0] + 1}: found {times[off[0]]:.9g} s, far off all others",
         )
     return times
 
@@ -119,16 +118,16 @@ def _poses(path: Path) -> Array:
         wrong = ~(off <= SIX_DIGITS) | ~(np.linalg.det(R) > 0)
     if wrong.any():
         line = int(np.flatnonzero(wrong)[0])
-        raise DataError(
-            f"{shown(path)}: line {line + 1}: {kitti_calibration.rotation_fault(R[line])}, expected a rotation in a"
-            f" rigid pose; {wrong.sum()} of {len(poses)} poses have this fault"
+        raise refused(
+            path,
+            f"line {line + 1}: {kitti_calibration.rotation_fault(R[line])} in {wrong.sum()} of {len(poses)} poses",
         )
     far = ~(np.abs(poses[:, :, 3]) <= FARTHEST_M).all(axis=1)
     if far.any():
         line = int(np.flatnonzero(far)[0])
-        raise DataError(
-            f"{shown(path)}: line {line + 1}: found a position {np.abs(poses[line, :, 3]).max():.3g} m away, expected"
-            f" at most {FARTHEST_M:g} m"
+        raise refused(
+            path,
+            f"line {line + 1}: found a position {np.abs(poses[line, :, 3]).max():.3g} m away",
         )
     return poses
 

@@ -22,7 +22,7 @@ from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.kitti_stamps import stamps_ns
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_folder, read_text, shown
+from gnss_sem_map.files.untrusted import is_folder, read_text, refused, shown
 from gnss_sem_map.sensor_log import Skip, skipped
 
 Array = NDArray[np.float64]
@@ -79,9 +79,9 @@ def navigation(drive: Path, twins: tuple[Path, ...], with_imu: bool = True) -> N
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
     is_fix, invalid = valid_fixes(stamps, oxts[:, [LAT, LON, ALT]], oxts[:, [POSITION_ACCURACY]])
     if not is_fix.any():
-        raise DataError(
-            f"{shown(drive / 'oxts')}: not one of {len(oxts)} rows is a fix; found {next(iter(invalid))}; expected"
-            " degrees, metres of WGS 84 and an accuracy above 0 (columns 1 to 3, and 24)"
+        raise refused(
+            drive / "oxts",
+            f"not one of {len(oxts)} rows is a fix; found {next(iter(invalid))} (columns 1 to 3, 24)",
         )
     fix_skips = skipped("fix", drive / "oxts", "rows", invalid)
     epoch_ns = int(oxts_ns[0])
@@ -128,9 +128,10 @@ def oxts_rows(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
         skips.append(Skip("oxts", shown(drive / "oxts"), told))
     order = sorted(rows)
     if len(order) < 3:
-        raise DataError(
-            f"{shown(drive / 'oxts')}: found {len(order)} usable rows of {len(found.files)}, expected at least 3"
-            + (f"; first reason: {skips[0].where}: {skips[0].reason}" if skips else "")
+        raise refused(
+            drive / "oxts",
+            f"found {len(order)} usable rows of {len(found.files)}, expected at least 3"
+            + (f"; first reason: {skips[0].where}: {skips[0].reason}" if skips else ""),
         )
     return _measured(drive, np.array(order, np.int64), np.stack([rows[stamp] for stamp in order]), skips)
 

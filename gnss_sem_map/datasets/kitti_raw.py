@@ -125,9 +125,7 @@ def _sensor(of_cameras: Path, camera: str, T_camera0_lidar: Array) -> Camera:
     try:
         about = CalibrationFile(of_cameras, {S: 2, K: 9, D: 5, R: 9, T: 3})
     except DataError as error:
-        raise DataError(
-            f"{error}; the images are not of the size S_rect_{camera}, as rectified ones are"
-        ) from None
+        raise DataError(f"{error}; its images are not rectified, of the size S_rect_{camera}") from None
     lens = Distortion(model="brown", coefficients=tuple(about.rows[D].tolist()))
     T_camera_lidar = kitti_calibration.exact(about.pose(R, T) @ T_camera0_lidar)
     return Camera(T_camera_lidar, about.rows[K].reshape(3, 3), about.size(S), CAMERA_TIME_OFFSET_S, lens)

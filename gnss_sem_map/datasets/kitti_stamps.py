@@ -9,7 +9,7 @@ import numpy as np
 
 from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import expect_file, read_lines, shown
+from gnss_sem_map.files.untrusted import expect_file, read_lines, refused, shown
 from gnss_sem_map.sensor_log import Skip
 
 STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
@@ -41,6 +41,4 @@ def stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
 
 
 def _no_stamp(path: Path, number: int, text: str) -> DataError:
-    return DataError(
-        f"{shown(path)}: line {number + 1}: found {text[:40]!r}, expected `yyyy-mm-dd hh:mm:ss.nnnnnnnnn`"
-    )
+    return refused(path, f"line {number + 1}: found {text[:40]!r}, expected `yyyy-mm-dd hh:mm:ss.nnnnnnnnn`")

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.stamps import LONGEST_SWEEP_S
-from gnss_sem_map.errors import DataError, PointTimesError
+from gnss_sem_map.errors import PointTimesError
+from gnss_sem_map.files.untrusted import refused
 
 Array = NDArray[np.float64]
 
@@ -40,9 +41,7 @@ def leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> N
             )
         rows[outside, :3], after[outside] = np.nan, 0.0
     if np.ptp(after) > LONGEST_SWEEP_S:
-        raise DataError(
-            f"{where}: the sweep takes {np.ptp(after):.4g} s, expected at most {LONGEST_SWEEP_S:g}"
-        )
+        raise refused(where, f"the sweep takes {np.ptp(after):.4g} s, expected at most {LONGEST_SWEEP_S:g}")
 
 
 def _mistake_of(after: Array) -> str:

@@ -23,7 +23,6 @@ from gnss_sem_map.datasets.receiver import Receiver, measured
 from gnss_sem_map.datasets.ros import clouds, pictures, receiver_topics, roles
 from gnss_sem_map.datasets.ros.bag import METADATA, SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
-from gnss_sem_map.datasets.ros.decoding import header_ns
 from gnss_sem_map.datasets.ros.fix_topics import fix_rows
 from gnss_sem_map.datasets.ros.imu_topics import samples_of
 from gnss_sem_map.datasets.ros.rig import (
@@ -34,10 +33,10 @@ from gnss_sem_map.datasets.ros.rig import (
     read_rig,
     rig_file,
 )
-from gnss_sem_map.datasets.ros.stamps import Clock, stamps_of
+from gnss_sem_map.datasets.ros.stamps import Clock, header_ns, stamps_of
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.files.untrusted import refused, shown
 from gnss_sem_map.sensor_log import Image, Lidar, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
@@ -105,9 +104,7 @@ def _receiver(bag: Bag, rig: Rig, place: Path, p_imu_antenna: Array) -> tuple[in
     where, second = shown(bag.path), rig.gnss.p_imu_antenna2
     valid, invalid = valid_fixes(fixes[:, 0], fixes[:, 1:4], fixes[:, 4:7])
     if not valid.any():
-        raise DataError(
-            f"{where}: not one of {len(fixes)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
-        )
+        raise refused(where, f"not one of {len(fixes)} fixes is usable ({next(iter(invalid), 'none')})")
     skips += [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
     rows = of_velocity = of_heading = fixes[valid]
     if rig.gnss.velocity is not None:

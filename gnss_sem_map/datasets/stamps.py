@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.stamps import far_off, unit_fault
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.sensor_log import Skip
 
 LONGEST_SWEEP_S = 1.0
@@ -40,7 +40,7 @@ T = TypeVar("T", bound=Stamped)
 def check_unit(stamps: NDArray[np.float64], longest_step_s: float, where: str) -> None:
     """Raise DataError, with the likely unit, when the usual step between the stamps is longer than any sensor's."""
     if fault := unit_fault(stamps, longest_step_s):
-        raise DataError(f"{where}: {fault}")
+        raise refused(where, f"{fault}")
 
 
 def check_date(stamp: float, epoch_ns: int, where: str) -> None:
@@ -50,14 +50,15 @@ def check_date(stamp: float, epoch_ns: int, where: str) -> None:
     """
     year = 1970 + (stamp + epoch_ns * 1e-9) / (365.2425 * 86400)
     if abs(year - 1970) > LAST_YEAR - 1970:
-        raise DataError(
-            f"{where}: the stamp {stamp:.10g} s is of the year {year:.0f}, expected one up to {LAST_YEAR}; seconds are"
-            " those since `epoch_ns` of log.yaml, or Unix time without it"
+        raise refused(
+            where,
+            f"the stamp {stamp:.10g} s is of the year {year:.0f}, expected one up to {LAST_YEAR},"
+            " in seconds since `epoch_ns` of log.yaml",
         )
     if epoch_ns and year < FIRST_YEAR:
-        raise DataError(
-            f"{where}: with `epoch_ns: {epoch_ns}` of log.yaml the stamp {stamp:.10g} s is of the year {year:.0f},"
-            f" expected one from {FIRST_YEAR}; `epoch_ns` is the Unix time of stamp zero in nanoseconds"
+        raise refused(
+            where,
+            f"{stamp:.10g} s after `epoch_ns: {epoch_ns}` of log.yaml, its Unix time in nanoseconds, is in {year:.0f}",
         )
 
 

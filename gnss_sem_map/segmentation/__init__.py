@@ -130,15 +130,14 @@ def open_segmenter(
     close = difflib.get_close_matches(scheme, SCHEMES, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""
     raise ConfigError(
-        f"segmenter {spec!r}: unknown kind {scheme!r}; {hint}expected one of {list(SCHEMES.values())}; `run` also"
-        " takes none, for the geometry alone"
+        f"segmenter {spec!r}: unknown kind {scheme!r}; {hint}expected none, or one of {list(SCHEMES.values())}"
     )
 
 
 def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
     if len(spec) > LONGEST_SPEC:
         raise ConfigError(
-            f"segmenter {spec[:100]!r}: found {len(spec)} characters, expected at most {LONGEST_SPEC}"
+            f"segmenter {spec[:100]!r}: {len(spec)} characters, at most {LONGEST_SPEC} are read"
         )
     scheme, colon, rest = spec.partition(":")
     place, mark, query = rest.partition("?")
@@ -146,9 +145,7 @@ def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
     if scheme in SCHEMES and scheme != "demo" and (not colon or not place):
         raise ConfigError(f"segmenter {spec!r}: found nothing after {scheme!r}; expected {SCHEMES[scheme]}")
     if mark and not options:
-        raise ConfigError(
-            f"segmenter {spec!r}: found no options after '?', expected name=value joined by '&'"
-        )
+        raise ConfigError(f"segmenter {spec!r}: found no options after '?', expected a=b&c=d")
     return scheme, place, options
 
 
@@ -157,9 +154,7 @@ def _needs(extra: str, spec: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"segmenter {spec!r}: {error.name} is not installed; {how_to_install(extra)}"
-        ) from None
+        raise ConfigError(f"segmenter {spec!r}: {error.name} is missing; {how_to_install(extra)}") from None
 
 
 def _only(options: dict[str, str], spec: str, *allowed: str) -> None:

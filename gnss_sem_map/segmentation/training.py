@@ -24,6 +24,7 @@ from torch.nn.functional import cross_entropy, interpolate
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.ownership import MARKER, write_list
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.process.machine import threads
 from gnss_sem_map.process.prefetch import prefetch
@@ -154,9 +155,7 @@ def mean_iou(
     either = confusion.sum(0) + confusion.sum(1) - confusion.diagonal()
     iou = np.where(confusion.sum(1) > 0, confusion.diagonal() / np.maximum(either, 1), np.nan)
     if np.isnan(iou[:-1]).all():
-        raise DataError(
-            f"{data.pairs[0][1].parent}: found none of {data.class_names[:-1]} in the validation labels"
-        )
+        raise DataError(f"{data.pairs[0][1].parent}: no {data.class_names[:-1]} in the validation labels")
     return float(np.nanmean(iou[:-1])), iou
 
 
@@ -206,9 +205,7 @@ class _Run:
         target = torch.from_numpy(truth).to(self.device).long()
         loss = cross_entropy(enlarged, target, self._weights, ignore_index=IGNORE)
         if not torch.isfinite(loss):
-            raise DataError(
-                f"{self._out}: the loss of step {step} is not finite; lower the learning rate, or raise the precision"
-            )
+            raise DataError(f"{self._out}: the loss of step {step} is not finite; lower the learning_rate")
         self._scaler.scale(loss).backward()
         self._scaler.unscale_(self._optimiser)
         nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -255,17 +252,13 @@ class _Run:
         try:
             state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
         except LOAD_ERRORS as error:
-            raise DataError(
-                f"{path}: damaged ({type(error).__name__}); remove the folder and train again"
-            ) from None
+            raise refused(path, f"damaged ({type(error).__name__}); remove it, train again") from None
         expected = self.settings.model_dump(mode="json")
         changed = {
             n: (state["settings"].get(n), v) for n, v in expected.items() if state["settings"].get(n) != v
         }
         if changed or state["class_names"] != list(self._data.class_names):
-            raise ConfigError(
-                f"{path}: was started with other settings (then, now): {changed}; resume with the same ones"
-            )
+            raise ConfigError(f"{path}: other settings then and now: {changed}; resume with the same ones")
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self._scaler.load_state_dict(state["scaler"])
@@ -339,9 +332,7 @@ def _claim(out: Path) -> None:
         strange = sorted({path.name for path in out.iterdir()} - own)
         ours = (out / STATE).exists() or ((out / MARKER).exists() and not strange)  # a run has a list, too
         if any(out.iterdir()) and not ours:
-            raise ConfigError(
-                f"{out}: holds {(strange or [NETWORK])[0]} and no training; choose an empty folder"
-            )
+            raise ConfigError(f"{out}: holds {(strange or [NETWORK])[0]}, no training; choose another folder")
         if not ours:
             write_list(out)
 
@@ -356,7 +347,7 @@ def _writing(out: Path) -> Iterator[None]:
         SafetensorError,
     ) as error:  # the last two are of torch and safetensors
         reason = str(error).splitlines()[0]
-        raise DataError(f"{out}: cannot be written ({reason}); free some space there, then resume") from None
+        raise refused(out, f"cannot be written ({reason}); free some space there, then resume") from None
 
 
 def _append_row(path: Path, header: list[str], row: list[object]) -> None:

@@ -53,7 +53,7 @@ class Points:
         n = len(self.xyz)
         if self.xyz.shape != (n, 3) or self.intensity.shape != (n,):
             raise DataError(
-                f"points: found shapes {self.xyz.shape} and {self.intensity.shape}, expected (n, 3) and (n,)"
+                f"points: found {self.xyz.shape} and {self.intensity.shape}, expected (n, 3), (n,)"
             )
         if self.stamps is not None and self.stamps.shape != (n,):
             raise DataError(f"points: found {self.stamps.shape} stamps for {n} points, expected one each")
@@ -249,9 +249,7 @@ class SensorLog:
             or not all(re.fullmatch(NAME, name) for name in names)
             or (self.others and "" in names)
         ):
-            raise DataError(
-                f"{self.name}: found LiDARs {names}, expected names of letters, digits, _ and -, all different"
-            )
+            raise DataError(f"{self.name}: found LiDARs {names}, expected letters, digits, _, -, once")
         stamps = {"scans": [scan.stamp for scan in self.scans]}
         for lidar in self.others:
             stamps[f"scans of {lidar.name}"] = [scan.stamp for scan in lidar.scans]
@@ -259,17 +257,13 @@ class SensorLog:
             stamps[f"images of {name}" if name else "images"] = found
         for what, some in stamps.items():
             if any(b <= a for a, b in pairwise(some)):
-                raise DataError(
-                    f"{self.name}: stamps of the {what} do not increase; sort and remove repeats first"
-                )
+                raise DataError(f"{self.name}: stamps of {what} do not increase; sort them, remove repeats")
 
     def check_located(self) -> None:
         """Raise DataError when neither poses nor IMU with GNSS say where the vehicle was."""
         if self.given is None and (self.imu is None or self.gnss is None):
             lost = next((f"{skip.where}: {skip.reason}" for skip in self.skips if skip.what == SENSOR), None)
-            raise DataError(
-                lost or f"{self.name}: found neither poses nor IMU with GNSS; expected one of them"
-            )
+            raise DataError(lost or f"{self.name}: expected poses, or IMU and GNSS")
 
     @property
     def folders(self) -> set[Path]:
@@ -330,8 +324,7 @@ class SensorLog:
             of = f" of {self.lidar}" if self.lidar else ""
             why = next((f" ({skip.where}: {skip.reason})" for skip in self.skips if skip.what == "scan"), "")
             raise DataError(
-                f"{self.name}: has no LiDAR scan{of} to map, or none that --frames names{why}; for the trajectory"
-                " alone: gnss-sem-map trajectory"
+                f"{self.name}: no LiDAR scan{of} to map, or in --frames{why}; `gnss-sem-map trajectory` needs none"
             )
 
     @property

@@ -68,9 +68,7 @@ class Distortion(BaseModel):
         counts = COEFFICIENTS[self.model]
         if len(self.coefficients) not in counts:
             expected = " or ".join(map(str, counts))
-            raise ValueError(
-                f"found {len(self.coefficients)} coefficients, expected {expected} for {self.model}"
-            )
+            raise ValueError(f"found {len(self.coefficients)} coefficients, not {expected}: {self.model}")
         if self.xi and self.model != "mei":
             raise ValueError(f"found xi {self.xi} for {self.model}; only mei has it")
         return self
@@ -169,18 +167,14 @@ class Camera:
     def __post_init__(self) -> None:
         of = f" of camera {self.name}" if self.name else ""
         if not re.fullmatch(NAME, self.name):
-            raise DataError(
-                f"calibration: found a camera {self.name!r}, expected letters, digits, _ and -; folders have its name"
-            )
+            raise DataError(f"calibration: found a camera {self.name!r}, expected letters, digits, _ and -")
         if not is_rigid(self.T_camera_lidar):
             raise DataError(
                 f"calibration{of}: T_camera_lidar is no rigid transform (found shape {np.shape(self.T_camera_lidar)},"
                 " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
             )
         if self.K.shape != (3, 3) or self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
-            raise DataError(
-                f"calibration{of}: found intrinsics {self.K.tolist()}, expected 3 x 3 with positive focal lengths"
-            )
+            raise DataError(f"calibration{of}: found K {self.K.tolist()}, expected focal lengths above 0")
 
     def projection(self, T_camera_source: Array) -> Array:
         """What takes points to this camera (3, 4): to its pixels where it has no distortion, else into its frame."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from factor_graphs.receiver_rows import with_more
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -34,6 +36,16 @@ class Positions:
     """What else it tells, (n, 3) each, by the names of `receiver_rows.with_more`; NaN where a row does not."""
     above_geoid: NDArray[np.bool_] | None = None
     """(n,) of which the height is above the geoid; of the others it is above the ellipsoid."""
+
+
+def rows_of(
+    found: Positions, zero_ns: int, stamps_ns: NDArray[np.int64], stddevs_m: Sequence[float] | None
+) -> Array:
+    """Rows (n, 18) as `receiver_rows.ROW_COLUMNS`, with seconds from `zero_ns` on, and other deviations if given."""
+    stddevs = found.stddevs if stddevs_m is None else np.tile(stddevs_m, (len(stamps_ns), 1))
+    table = np.column_stack([(stamps_ns - zero_ns) * 1e-9, found.geodetic, stddevs])
+    more = {} if stddevs_m is None else {"correlations": np.full((1, 3), np.nan)}
+    return with_more(table, **found.more | more)
 
 
 def without_heights(where: str, count: int) -> Skip:

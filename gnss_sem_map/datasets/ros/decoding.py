@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import struct
 from functools import cache
 from typing import Any
 
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.kinds import DEFINITIONS, HEADLESS
-from gnss_sem_map.errors import DataError
-
-HEAD_BYTES = 16
-"""From the start of a message to the end of its header's stamp."""
+from gnss_sem_map.datasets.ros.kinds import DEFINITIONS
+from gnss_sem_map.errors import one_line
+from gnss_sem_map.files.untrusted import refused
 
 
 @cache
@@ -37,22 +34,4 @@ def decode(bag: Bag, messages: Messages, k: int) -> Any:
         # generated code reads bytes that may be anything: it fails in as many ways as there are bytes
         if isinstance(error, MemoryError):
             raise
-        raise DataError(
-            f"{messages.topic}: message {k} is no {messages.kind} ({type(error).__name__} {str(error)[:80]})"
-        ) from None
-
-
-def header_ns(bag: Bag, messages: Messages, k: int) -> int:
-    """The stamp in the header of a message, Unix ns, or its arrival where the type has none; raises DataError."""
-    if messages.kind in HEADLESS:
-        return int(messages.received_ns[k])
-    head = bag.read(messages, k, HEAD_BYTES)
-    try:
-        if messages.is_ros1:
-            _, seconds, nanoseconds = struct.unpack_from("<III", head)
-        else:
-            order = "<" if head[1] & 1 else ">"
-            seconds, nanoseconds = struct.unpack_from(f"{order}iI", head, 4)
-    except (struct.error, IndexError):
-        raise DataError(f"{messages.topic}: message {k} has {len(head)} bytes, no header") from None
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+        raise refused(messages.topic, f"message {k} is no {messages.kind} ({one_line(error, 80)})") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,14 @@ from factor_graphs.csv_log import NOT_DEFINITE
 from factor_graphs.position_covariances import split_covariances
 from factor_graphs.receiver_rows import with_more
 from gnss_sem_map.datasets.gnss_files import nmea
-from gnss_sem_map.datasets.gnss_files.positions import FLAT_STDDEV_M, without_heights
+from gnss_sem_map.datasets.gnss_files.positions import FLAT_STDDEV_M, rows_of, without_heights
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
 from gnss_sem_map.datasets.ros.kinds import SENTENCE, STRING
 from gnss_sem_map.datasets.ros.rig import GnssTopic
 from gnss_sem_map.datasets.ros.stamps import JUMP_NS, stamps_of
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.sensor_log import Skip
+from gnss_sem_map.files.untrusted import refused
+from gnss_sem_map.sensor_log import Skip, skipped
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -41,27 +42,28 @@ def fix_rows(bag: Bag, topic: str, about: GnssTopic) -> tuple[Array, Ints, list[
         rows, ns, lost = _of_sentences(bag, messages, said, about)
         return rows, ns, skips + lost
     places, stamps, covariances = [], [], []
-    counts: dict[str, int] = {}
+    counts = Counter[str]()
     for k in np.flatnonzero(believed).tolist():
         fix = decode(bag, messages, k)
         why, covariance = covariance_of(fix)
         if why and about.stddevs_m is not None:
             covariance = np.diag(np.square(about.stddevs_m))
         if fix.status.status == NO_FIX:
-            counts["no fix"] = counts.get("no fix", 0) + 1
+            counts["no fix"] += 1
         elif covariance is None:
-            counts[why] = counts.get(why, 0) + 1
+            counts[why] += 1
         else:
             places.append([fix.latitude, fix.longitude, fix.altitude])
             covariances.append(covariance)
             stamps.append(int(said[k]))
     if not places:
-        raise DataError(
-            f"{messages.topic}: not one of {len(messages)} messages is a fix"
+        raise refused(
+            messages.topic,
+            f"not one of {len(messages)} messages is a fix"
             f" ({', '.join(f'{count}: {why}' for why, count in counts.items()) or 'no messages'});"
-            " where only covariances are unknown or zero, set gnss.stddevs_m in rig.yaml"
+            " where only covariances are unknown or zero, set gnss.stddevs_m in rig.yaml",
         )
-    skips += [Skip("fix", messages.topic, f"{count} messages: {why}", count) for why, count in counts.items()]
+    skips += skipped("fix", messages.topic, "messages", counts)
     if np.isnan(np.array(places)[:, 2]).all():
         skips.append(without_heights(messages.topic, len(places)))
         places = [[lat, lon, 0.0] for lat, lon, _ in places]
@@ -108,6 +110,4 @@ def _of_sentences(
         stamps = stamps + off_ns
         reason = f"the stamps are {off_ns * 1e-9:+.1f} s off the times in the sentences: their clock is taken"
         skips.append(Skip("clock", messages.topic, reason))
-    stddevs = found.stddevs if about.stddevs_m is None else np.tile(about.stddevs_m, (len(stamps), 1))
-    table = np.column_stack([(stamps - stamps[0]) * 1e-9, found.geodetic, stddevs])
-    return with_more(table, **found.more), stamps, skips
+    return rows_of(found, int(stamps[0]), stamps, about.stddevs_m), stamps, skips

@@ -51,9 +51,7 @@ class StaticTransforms:
         found = _between(self._edges, target, source)
         found = _between(self._all, target, source) if found is None else found
         if found is None and self._wrong:
-            raise DataError(
-                f"{'; '.join(self._wrong.values())[:400]}; give the poses (T_imu_lidar, T_camera_lidar) in rig.yaml"
-            )
+            raise DataError(f"{'; '.join(self._wrong.values())[:400]}; give the poses in rig.yaml")
         return found
 
 
@@ -77,8 +75,7 @@ def _ancestors(edges: Edges, frame: str) -> dict[str, Array]:
         at, edge = edges[at]
         if at in found:
             raise DataError(
-                f"fixed transforms: found a circle of frames, {' > '.join([*found, at])}; expected a tree; give the"
-                " poses (T_imu_lidar, T_camera_lidar) in rig.yaml"
+                f"fixed transforms: a circle of frames, {' > '.join([*found, at])}; give the poses in rig.yaml"
             )
         T = edge if T is None else edge @ T  # no product with the identity: the edge to the bit
         found[at] = T

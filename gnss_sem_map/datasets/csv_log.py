@@ -48,10 +48,15 @@ from factor_graphs.surveyed_points import SurveyedPoints
 from factor_graphs.tables import layout_of
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
+from gnss_sem_map.datasets.gnss_files.positions import Receiver, measured
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
-from gnss_sem_map.datasets.point_times import leave_out_of_sweep
-from gnss_sem_map.datasets.receiver import Receiver, measured
-from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
+from gnss_sem_map.datasets.stamps import (
+    LONGEST_FRAME_STEP_S,
+    check_date,
+    check_unit,
+    in_order,
+    leave_out_of_sweep,
+)
 from gnss_sem_map.errors import DataError, errors_of_measurements
 from gnss_sem_map.files.pictures import read_picture
 from gnss_sem_map.files.untrusted import expect_file, inside, is_file, is_folder, read_bytes, refused, shown

@@ -27,6 +27,8 @@ NO_POINTS, EVERY = 0.1, 8
 """A file with a larger share of points out of these bounds is no scan: of random bytes, nine in ten coordinates are
 out of bounds. Every eighth point is tested."""
 LARGEST_NUMBER = 2**63 - 1
+OF_KITTI = ("data", "data_rgb", "data_rect")
+"""Folders of files within that of a sensor, by which it is named."""
 
 T = TypeVar("T")
 State = tuple[int, int]
@@ -52,7 +54,7 @@ class Frames:
 
     def missing(self, known: Iterable[int]) -> list[Skip]:
         """One skip for every run of known frames without a file."""
-        folder = self.folder.parent if self.folder.name == "data" else self.folder
+        folder = self.folder.parent if self.folder.name in OF_KITTI else self.folder
         absent = sorted(set(known) - set(self.files))
         breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
         runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.datasets import frames, kitti_calibration, kitti_oxts, kitti_raw, kitti_stamps
+from gnss_sem_map.datasets import frames, kitti_calibration, kitti_oxts, kitti_raw
 from gnss_sem_map.datasets.kitti_calibration import read_table
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.files.structured import MOST_YAML_BYTES, fault_of, parse_yaml
@@ -89,7 +89,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     """Open a KITTI-360 drive; raises DataError when calibration, stamps or poses are missing or malformed."""
     root, name = _root(drive), drive.resolve().name
     about, poses = root / "calibration", root / "data_poses" / name
-    stamps_ns, skips = kitti_stamps.stamps_ns(drive / "velodyne_points" / "timestamps.txt")
+    stamps_ns, skips = kitti_calibration.stamps_ns(drive / "velodyne_points" / "timestamps.txt")
     if not stamps_ns:
         raise refused(drive / "velodyne_points" / "timestamps.txt", "found no stamp")
     unit = None

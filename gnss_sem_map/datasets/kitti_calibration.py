@@ -1,7 +1,8 @@
-"""KITTI's calibration files: rows `name: numbers`, and what they stand for; and tables of numbers without names."""
+"""KITTI's calibration files: rows `name: numbers`, and what they stand for; tables of numbers; and stamps."""
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
@@ -13,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import expect_file, is_file, read_bytes, read_lines, refused, shown
+from gnss_sem_map.sensor_log import Skip
 from gnss_sem_map.sensor_log.cameras import is_rigid
 
 Array = NDArray[np.float64]
@@ -23,6 +26,7 @@ MOST_BYTES = 1 << 20
 LARGEST = 1e6
 """Largest length in m or px."""
 LARGEST_SIDE_PX = 65_535
+STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
 
 
 class CalibrationFile:
@@ -145,3 +149,32 @@ def read_table(path: Path, columns: int) -> Array:
     if not rows:
         raise refused(path, f"empty; expected {expected}")
     return np.array(rows)
+
+
+def stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
+    """Unix nanoseconds by frame number; blank lines are missing frames.
+
+    Stamps of impossible years are skipped, and those in a leap second, which Unix time does not have.
+    """
+    expect_file(path, "stamps, one line `date time` per frame")
+    stamps, skips = {}, []
+    for number, line in enumerate(read_lines(path)):
+        text = line.strip()
+        if not text:
+            continue
+        if STAMP.fullmatch(text) is None:
+            raise _no_stamp(path, number, text)
+        is_leap_second = text[17:19] == "60"
+        if is_leap_second or not FIRST_YEAR <= int(text[:4]) <= LAST_YEAR:
+            why = "in a leap second" if is_leap_second else "no time of a drive"
+            skips.append(Skip("stamp", f"{shown(path)}: line {number + 1}", f"found {text}, {why}"))
+            continue
+        try:
+            stamps[number] = int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
+        except ValueError:
+            raise _no_stamp(path, number, text) from None
+    return stamps, skips
+
+
+def _no_stamp(path: Path, number: int, text: str) -> DataError:
+    return refused(path, f"line {number + 1}: found {text[:40]!r}, expected `yyyy-mm-dd hh:mm:ss.nnnnnnnnn`")

@@ -20,7 +20,7 @@ from factor_graphs.stamps import far_off
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets import frames
-from gnss_sem_map.datasets.kitti_stamps import stamps_ns
+from gnss_sem_map.datasets.kitti_calibration import stamps_ns
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_folder, read_text, refused, shown
 from gnss_sem_map.sensor_log import Skip, skipped

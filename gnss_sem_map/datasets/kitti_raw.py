@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets import frames, kitti_calibration
-from gnss_sem_map.datasets.kitti_calibration import CalibrationFile
+from gnss_sem_map.datasets.kitti_calibration import CalibrationFile, stamps_ns
 from gnss_sem_map.datasets.kitti_oxts import OXTS_NOISE, navigation
-from gnss_sem_map.datasets.kitti_stamps import stamps_ns
 from gnss_sem_map.datasets.stamps import in_order, sweep_fault
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.pictures import read_picture

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.functional import cross_entropy, interpolate
 
 from gnss_sem_map.errors import ConfigError, DataError
@@ -36,7 +36,7 @@ from gnss_sem_map.segmentation.checkpoints import (
     read_checkpoint,
     write_network,
 )
-from gnss_sem_map.segmentation.networks import enough_memory, find_device, placed
+from gnss_sem_map.segmentation.networks import enough_memory, find_device, normalised, placed
 from gnss_sem_map.segmentation.pixels import scaled
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 from gnss_sem_map.segmentation.training_data import (
@@ -135,19 +135,15 @@ def mean_iou(
     network: nn.Module, data: LabelledImages, scale: float, device: torch.device
 ) -> tuple[float, NDArray[np.float64]]:
     """Mean intersection over union of the map's classes (`other` is none of them), and that of every class, (c,)."""
-    count = len(data.class_names)
+    count, prepare = len(data.class_names), normalised(MEAN, STD, device)
     confusion = np.zeros((count, count), np.int64)
     network.eval()
     for index in range(len(data.pairs)):
         pixels, truth = data.read(index)
         with torch.inference_mode():
-            logits = network(_to_input(scaled(pixels, 1, scale)[None], device))
-            seen = (
-                interpolate(logits, truth.shape, mode="bilinear", align_corners=False)
-                .argmax(1)[0]
-                .cpu()
-                .numpy()
-            )
+            logits = network(prepare(scaled(pixels, 1, scale)[None]))
+            enlarged = interpolate(logits, truth.shape, mode="bilinear", align_corners=False)
+            seen = enlarged.argmax(1)[0].cpu().numpy()
         valid = truth != IGNORE
         confusion += np.bincount(count * truth[valid].astype(int) + seen[valid], minlength=count**2).reshape(
             count, count
@@ -167,6 +163,7 @@ class _Run:
         out: Path, resume: bool,
     ) -> None:  # fmt: skip
         self.settings, self.device, self._data, self._out = settings, device, data, out
+        self._prepare = normalised(MEAN, STD, device)
         torch.manual_seed(settings.seed)
         self.network = placed(_first_network(settings, data.class_names, initial), device)
         self._optimiser = torch.optim.AdamW(
@@ -200,7 +197,7 @@ class _Run:
         self._optimiser.zero_grad()
         mixed = self._precision is not torch.float32
         with torch.autocast(self.device.type, self._precision, enabled=mixed):
-            logits = self.network(_to_input(pixels, self.device))
+            logits = self.network(self._prepare(pixels))
         enlarged = interpolate(logits.float(), truth.shape[1:], mode="bilinear", align_corners=False)
         target = torch.from_numpy(truth).to(self.device).long()
         loss = cross_entropy(enlarged, target, self._weights, ignore_index=IGNORE)
@@ -318,12 +315,6 @@ def _from_checkpoint(path: Path, class_names: tuple[str, ...]) -> nn.Module:
     return network
 
 
-def _to_input(pixels: NDArray[np.uint8], device: torch.device) -> Tensor:
-    batch = torch.from_numpy(pixels).to(device).permute(0, 3, 1, 2).float() / 255
-    mean, std = (torch.tensor(v, device=device).reshape(3, 1, 1) for v in (MEAN, STD))
-    return (batch - mean) / std
-
-
 def _claim(out: Path) -> None:
     """Make the folder of a training; raises ConfigError for one with other files."""
     with _writing(out):
@@ -341,11 +332,7 @@ def _claim(out: Path) -> None:
 def _writing(out: Path) -> Iterator[None]:
     try:
         yield
-    except (
-        OSError,
-        RuntimeError,
-        SafetensorError,
-    ) as error:  # the last two are of torch and safetensors
+    except (OSError, RuntimeError, SafetensorError) as error:  # the last two are of torch and safetensors
         reason = str(error).splitlines()[0]
         raise refused(out, f"cannot be written ({reason}); free some space there, then resume") from None
 

@@ -34,7 +34,7 @@ from factor_graphs.surveyed_points import SurveyedPoints
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.untrusted import shown
-from gnss_sem_map.sensor_log.cameras import NAME, Camera, is_rigid
+from gnss_sem_map.sensor_log.cameras import NAME, Camera, check_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 
@@ -135,11 +135,7 @@ class Calibration:
     """(3,) m: the GNSS antenna in the imu frame."""
 
     def __post_init__(self) -> None:
-        if not is_rigid(self.T_imu_lidar):
-            raise DataError(
-                f"calibration: T_imu_lidar is no rigid transform (found shape {np.shape(self.T_imu_lidar)},"
-                " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
-            )
+        check_rigid(self.T_imu_lidar, ": T_imu_lidar")
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names) or (len(names) > 1 and "" in names):
             raise DataError(f"calibration: found cameras {names}, expected names, all different")

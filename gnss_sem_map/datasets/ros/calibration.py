@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from gnss_sem_map.datasets.ros.bag import Bag
-from gnss_sem_map.datasets.ros.decoding import decode
+from gnss_sem_map.datasets.ros.kinds import decode
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, LidarTopic, Rig, matrix
 from gnss_sem_map.datasets.ros.static_tf import StaticTransforms, read_static_transforms
 from gnss_sem_map.errors import DataError

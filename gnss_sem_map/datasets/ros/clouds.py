@@ -20,18 +20,17 @@ import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.frames import MOST_POINTS, refuse_other_bytes, scale_intensity
-from gnss_sem_map.datasets.point_times import are_returns, leave_out_of_sweep
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.kinds import LIVOX
+from gnss_sem_map.datasets.ros.kinds import LIVOX, decode
 from gnss_sem_map.datasets.ros.stamps import header_ns
-from gnss_sem_map.datasets.stamps import LONGEST_SWEEP_S
+from gnss_sem_map.datasets.stamps import LONGEST_SWEEP_S, are_returns, leave_out_of_sweep
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.sensor_log import Points
@@ -153,6 +152,7 @@ def _middles_and_spans(
 
 
 def read_cloud(
+    _file: Path,
     bag: Bag,
     messages: Messages,
     k: int,
@@ -161,7 +161,7 @@ def read_cloud(
     times: PointTimes,
     intensity_max: float | None = None,
 ) -> Points:
-    """A sweep.
+    """A sweep, in a file of the bag.
 
     `intensity_max` is the number for an intensity of 1; None: 1, and of an unsigned field its largest number.
     `stamp` s of the log, `stamp_ns` the same as Unix ns. Raises DataError for a damaged cloud, and PointTimesError for

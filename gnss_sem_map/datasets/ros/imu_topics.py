@@ -12,8 +12,7 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import ImuSamples, clean_imu
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.kinds import VECTOR
+from gnss_sem_map.datasets.ros.kinds import VECTOR, decode
 from gnss_sem_map.datasets.ros.rig import ImuTopic
 from gnss_sem_map.datasets.ros.stamps import stamps_of
 from gnss_sem_map.errors import DataError

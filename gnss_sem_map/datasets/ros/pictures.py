@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.kinds import COMPRESSED_IMAGE
+from gnss_sem_map.datasets.ros.kinds import COMPRESSED_IMAGE, decode
 from gnss_sem_map.errors import ImageSizeError
 from gnss_sem_map.files.pictures import JPEG, MOST_PIXELS, PNG, decoded_picture
 from gnss_sem_map.files.untrusted import refused
@@ -35,8 +35,10 @@ Of NV12 and NV21, rows of colours stand below those of the grey picture, half as
 """
 
 
-def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """RGB pixels (h, w, 3); raises DataError for a damaged image, another encoding, or another (width, height)."""
+def read_image(
+    _file: Path, bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None
+) -> NDArray[np.uint8]:
+    """RGB pixels (h, w, 3) of a message; raises DataError for a damaged one, another encoding or (width, height)."""
     message, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
     if why := unread_encoding(message):
         raise refused(

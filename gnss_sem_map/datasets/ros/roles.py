@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from gnss_sem_map.datasets.ros.bag import Bag
-from gnss_sem_map.datasets.ros.decoding import decode
 from gnss_sem_map.datasets.ros.imu_topics import part_of
-from gnss_sem_map.datasets.ros.kinds import INFO, KINDS, NAMED, unread
+from gnss_sem_map.datasets.ros.kinds import INFO, KINDS, NAMED, decode, unread
 from gnss_sem_map.datasets.ros.pictures import unread_encoding
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, ImuTopic, LidarTopic, Rig
 from gnss_sem_map.errors import DataError

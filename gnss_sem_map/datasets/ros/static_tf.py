@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.datasets.ros.bag import Bag
-from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.kinds import STRING, TRANSFORMS
+from gnss_sem_map.datasets.ros.kinds import STRING, TRANSFORMS, decode
 from gnss_sem_map.errors import DataError
 
 Array = NDArray[np.float64]

@@ -241,7 +241,7 @@ def foreign(rig: ros.Rig, kind: str, topic: str) -> list[ros.Message]:
     """Messages of a type that is not known here: the real ones begin with a header, too."""
     from rosbags.typesys import get_types_from_msg
 
-    from gnss_sem_map.datasets.ros.decoding import typestore
+    from gnss_sem_map.datasets.ros.kinds import typestore
 
     store = typestore(rig.is_ros1)
     if kind not in store.fielddefs:

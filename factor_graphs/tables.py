@@ -179,7 +179,7 @@ class Layout:
                 yield Column(k, units.get(str(unit), 1.0), True)
             elif at_end == "" and plain + str(unit) not in WORDS:
                 raise MeasurementError(
-                    f"column {self.header[k][:50]!r} has an unknown unit; expected one of {', '.join(units)}"
+                    f"column {self.header[k][:50]!r} is in a unit that is not known; expected one of {', '.join(units)}"
                 )
             elif at_end in units:
                 yield Column(k, units[at_end], True)

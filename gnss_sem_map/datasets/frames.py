@@ -48,8 +48,8 @@ class Frames:
         self, stamps: Mapping[int, T], why: str = "no stamp for this frame"
     ) -> tuple[list[tuple[int, Path, T]], list[Skip]]:
         """Number, file and stamp of the frames that have both; a skip for each other file, and run of other stamps."""
-        skips = [Skip(self.what, shown(path), why) for n, path in self.files.items() if n not in stamps]
-        skips += self.skips + self.missing(stamps)
+        skips = [*self.skips, *self.missing(stamps)]
+        skips += [Skip(self.what, shown(path), why) for n, path in self.files.items() if n not in stamps]
         return [(n, path, stamps[n]) for n, path in self.files.items() if n in stamps], skips
 
     def missing(self, known: Iterable[int]) -> list[Skip]:

@@ -48,8 +48,8 @@ class CalibrationFile:
             row = np.asarray(rows.get(name, ()), np.float64)
             if row.shape != (count,) or not (np.abs(row) <= LARGEST).all():
                 far = row[~(np.abs(row) <= LARGEST)].tolist() if row.shape == (count,) else []
-                found = f"{far[0]} among them" if far else f"{row.size or 'no'} numbers"
-                raise DataError(f"{self._where(name)}: found {found}, expected {count} finite numbers")
+                found = f"{far[0]} among them" if far else f"{row.size} numbers" if row.size else "nothing"
+                raise refused(path, f"row {name!r}: found {found}, expected {count} finite numbers")
             self.rows[name] = row
 
     def _where(self, name: str) -> str:

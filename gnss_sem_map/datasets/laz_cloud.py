@@ -70,7 +70,7 @@ def read_base(path: Path, frame: LocalFrame, geoid: Path | None = None) -> BaseC
         reason = one_line(error)
         raise refused(
             path,
-            f"is no LAS or LAZ ({reason}); damaged? pdal translate IN OUT.laz",
+            f"cannot be read as LAS or LAZ ({reason}); pdal translate IN OUT.laz",
         ) from None
     points = np.concatenate(parts)
     if not given:
@@ -123,7 +123,8 @@ class _Placing:
         if geoid is None:
             raise refused(
                 path,
-                f"its heights are those of {vertical.name}, without a grid; give its geoid with --geoid",
+                f"its heights are those of {vertical.name}, without a grid; give --geoid, or heights above the"
+                " ellipsoid",
             )
         return cls(frame, flat, unit_m, geoid)
 

@@ -49,7 +49,7 @@ def check_date(stamp: float, epoch_ns: int, where: str) -> None:
     if epoch_ns and year < FIRST_YEAR:
         raise refused(
             where,
-            f"{stamp:.10g} s after `epoch_ns: {epoch_ns}` of log.yaml, its Unix time in nanoseconds, is in {year:.0f}",
+            f"with `epoch_ns: {epoch_ns}` {stamp:.10g} s is of the year {year:.0f}; it is Unix time in nanoseconds",
         )
 
 

@@ -71,12 +71,12 @@ class LabelSet:
         count = len(self.names)
         if not 2 <= count <= 64 or len(set(self.names)) != count or OTHER in self.names:
             raise ConfigError(
-                f"class set {self.name!r}: {list(self.names)}, expected 2 to 64 different ones, no 'other'"
+                f"class set {self.name!r}: {list(self.names)}, expected 2 to 64 different names, no 'other'"
             )
         ids = self.semantic_kitti_ids.tolist()
         if {0, OTHER_SEMANTIC_KITTI_ID} & set(ids) or len(set(ids)) != count:
             raise ConfigError(
-                f"class set {self.name!r}: found semantic_kitti_id {ids}, expected different ones, neither 0 nor"
+                f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one for each class, neither 0 nor"
                 f" {OTHER_SEMANTIC_KITTI_ID}, which is `other`"
             )
         if len(self.roles) != count:
@@ -276,7 +276,7 @@ def _given_roles(name: str, classes: Sequence[Mapping[str, Any]]) -> tuple[Role 
     said = [c.get("role") for c in classes]
     if unknown := [role for role in said if role not in (None, *Role)]:
         raise ConfigError(
-            f"class set {str(name)[:LONGEST_WORD]!r}: role {str(unknown[0])[:99]!r} is none of {[*map(str, Role)]}"
+            f"class set {str(name)[:99]!r}: found the role {str(unknown[0])[:99]!r}, expected one of {[*map(str, Role)]}"
         )
     given = any("role" in c for c in classes)
     return tuple(None if role is None else Role(role) for role in said) if given else None

@@ -181,7 +181,7 @@ def _only_tensors(content: Any, path: Path) -> dict[str, Tensor]:
         or not content
         or not all(isinstance(t, Tensor) for t in content.values())
     ):
-        raise DataError(f"checkpoint {path}: found {type(content).__name__}, expected named tensors")
+        raise DataError(f"checkpoint {path}: found {type(content).__name__}, expected a state_dict")
     return {str(name).removeprefix("module."): tensor for name, tensor in content.items()}
 
 

@@ -320,7 +320,7 @@ class SensorLog:
             of = f" of {self.lidar}" if self.lidar else ""
             why = next((f" ({skip.where}: {skip.reason})" for skip in self.skips if skip.what == "scan"), "")
             raise DataError(
-                f"{self.name}: no LiDAR scan{of} to map, or in --frames{why}; `gnss-sem-map trajectory` needs none"
+                f"{self.name}: has no LiDAR scan{of}, or none that --frames names{why}; `trajectory` needs none"
             )
 
     @property

@@ -181,7 +181,7 @@ def _base(path: Path, header: list[str]) -> LocalFrame:
                 return LocalFrame(*(geodetic_of_ecef(place) if abs(place[0, 0]) > 90 else place)[0].tolist())
     raise refused(
         path,
-        "its positions are baselines; add their `% ref pos : LAT LON HEIGHT`, or solve as llh",
+        "its positions are baselines, no `ref pos` in its header; add it, or out-solformat=llh",
     )
 
 

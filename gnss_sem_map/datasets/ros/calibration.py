@@ -115,7 +115,7 @@ def _intrinsics(
     size = camera.image_size or found
     if not K.any() and not P.any():
         raise DataError(
-            f"{camera.info}: not calibrated, its CameraInfo is zero; set K and image_size, or cameras: {{}}"
+            f"{camera.info}: its CameraInfo is all zero: the camera was not calibrated; set K, image_size"
         )
     is_rectified = "rect" in camera.topic.lower() if camera.rectified is None else camera.rectified
     if camera.K is not None:

@@ -43,7 +43,7 @@ def read_image(
     if why := unread_encoding(message):
         raise refused(
             where,
-            f"found encoding {why!r}, expected PNG, JPEG, or {', '.join(ENCODINGS)}; image_transport republish",
+            f"found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; convert it",
         )
     if messages.kind == COMPRESSED_IMAGE:
         picture = decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)

@@ -130,7 +130,7 @@ def _only(bag: Bag, sensor: str, key: str, among: list[str] | None = None) -> st
     if len(found) > 1:
         raise refused(
             bag.path,
-            f"found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; set one in rig.yaml, {key}"
+            f"found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in rig.yaml, {key}"
             " (`gnss-sem-map inspect`)",
         )
     return found[0] if found else None

@@ -42,7 +42,7 @@ def stamps_of(bag: Bag, messages: Messages, clock: Clock) -> tuple[Ints, NDArray
     if int((~believed).sum()) > MOST_WRONG * len(said):
         raise refused(
             messages.topic,
-            f"{told}, ; set `stamps: received` for it in rig.yaml, to take the arrivals",
+            f"{told}; set `stamps: received` for this topic in rig.yaml",
         )
     return said, believed, [Skip("stamp", messages.topic, told, int((~believed).sum()))] if told else []
 

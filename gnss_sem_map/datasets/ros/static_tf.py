@@ -50,7 +50,9 @@ class StaticTransforms:
         found = _between(self._edges, target, source)
         found = _between(self._all, target, source) if found is None else found
         if found is None and self._wrong:
-            raise DataError(f"{'; '.join(self._wrong.values())[:400]}; give the poses in rig.yaml")
+            raise DataError(
+                f"{'; '.join(self._wrong.values())[:400]}; give T_imu_lidar and the like in rig.yaml"
+            )
         return found
 
 

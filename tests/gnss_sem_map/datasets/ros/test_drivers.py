@@ -178,7 +178,7 @@ def test_two_fields_of_one_name_that_is_read_are_refused(tmp_path: Path) -> None
     cloud = rig.messages[-1][2]
     cloud.fields.append(cloud.fields[0])
     with pytest.raises(
-        DataError, match=r"/points: message 0: found fields x, y, z, intensity, time, x, expected x"
+        DataError, match=r"/points: message 0: found fields x, y, z, intensity, time, x, expected each of x"
     ):
         opened(tmp_path, rig).scans[0].read()
 

@@ -76,14 +76,16 @@ class LabelSet:
         ids = self.semantic_kitti_ids.tolist()
         if {0, OTHER_SEMANTIC_KITTI_ID} & set(ids) or len(set(ids)) != count:
             raise ConfigError(
-                f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one for each class, neither 0 nor"
+                f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one each, no 0, nor"
                 f" {OTHER_SEMANTIC_KITTI_ID}, which is `other`"
             )
         if len(self.roles) != count:
             raise ConfigError(f"class set {self.name!r}: found {len(self.roles)} roles for {count} classes")
         for role in OF_ONE_CLASS:
             if len(those := [self.names[i] for i in self.having(role)]) > 1:
-                raise ConfigError(f"class set {self.name!r}: role {role} of {those}, expected one at most")
+                raise ConfigError(
+                    f"class set {self.name!r}: the role {role} at {those}, expected one at most"
+                )
         for source, table in self.sources.items():
             unknown = sorted(set(table.values()) - set(self.names))
             if unknown:
@@ -276,7 +278,7 @@ def _given_roles(name: str, classes: Sequence[Mapping[str, Any]]) -> tuple[Role 
     said = [c.get("role") for c in classes]
     if unknown := [role for role in said if role not in (None, *Role)]:
         raise ConfigError(
-            f"class set {str(name)[:99]!r}: found the role {str(unknown[0])[:99]!r}, expected one of {[*map(str, Role)]}"
+            f"{str(name)[:99]!r}: found the role {str(unknown[0])[:99]!r}, expected one of {[*Role]}"
         )
     given = any("role" in c for c in classes)
     return tuple(None if role is None else Role(role) for role in said) if given else None

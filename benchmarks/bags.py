@@ -22,7 +22,7 @@ import numpy as np
 
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.ros.bag import Bag
-from gnss_sem_map.datasets.ros.decoding import decode, typestore
+from gnss_sem_map.datasets.ros.kinds import decode, typestore
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import simulate
 from gnss_sem_map.simulation.layouts import rewrite

@@ -6,7 +6,7 @@ What has one obvious repair is repaired, with a warning that counts the rows; al
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,17 +63,13 @@ def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
     damaged rows than others, or has stamps in another unit than seconds.
     """
     imu_csv, gnss_csv = Path(folder) / "imu.csv", Path(folder) / "gnss.csv"
-    imu_rows = _numbers(imu_csv, IMU_COLUMNS, LONGEST_IMU_STEP_S)
+    imu_rows, of_imu = _numbers(imu_csv, IMU_COLUMNS, LONGEST_IMU_STEP_S)
     imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
-    gnss_rows, invalid = _receiver_rows(gnss_csv)
-    frame = LocalFrame(*(float(value) for value in gnss_rows[0, 1:4]))
+    gnss_rows, frame, of_gnss = _rows_in_frame(folder)
     fixes, gnss_repairs, no_covariance = fixes_of(gnss_rows, frame)
-    told = [f"{gnss_csv}: {n} rows dropped: {why}" for why, n in invalid.items()]
-    told += [f"{gnss_csv}: {no_covariance} rows: {NOT_DEFINITE}"] if no_covariance else []
-    for path, repairs in ((imu_csv, imu_repairs), (gnss_csv, gnss_repairs)):
-        told += [f"{path}: {repairs}"] if repairs.dropped or repairs.out_of_order else []
-    for message in told:
-        warnings.warn(message, RepairWarning, stacklevel=2)
+    of_gnss += [f"{no_covariance} rows: {NOT_DEFINITE}"] if no_covariance else []
+    _warn(imu_csv, imu_repairs, of_imu)
+    _warn(gnss_csv, gnss_repairs, of_gnss)
     return imu, fixes, frame
 
 
@@ -83,7 +79,7 @@ def read_velocities(folder: Path | str) -> GnssVelocities | None:
     Columns: ve_mps, vn_mps, vu_mps, east, north, up, and std_ve_mps, std_vn_mps, std_vu_mps; without those of up it is
     not measured. Rows are repaired, and errors raised, as by `read_csv`.
     """
-    rows, frame = _rows_in_frame(folder)
+    rows, frame, _ = _rows_in_frame(folder)
     velocities, repairs = velocities_of(rows, frame)
     _warn(Path(folder) / "gnss.csv", repairs)
     return velocities
@@ -96,22 +92,34 @@ def read_headings(folder: Path | str, baseline: ArrayLike | None = None) -> Ante
     one in the imu frame; None: the heading is that of the imu's x axis. Rows are repaired, and errors raised, as by
     `read_csv`.
     """
-    rows, frame = _rows_in_frame(folder)
+    rows, frame, _ = _rows_in_frame(folder)
     headings, repairs = headings_of(rows, frame, baseline)
     _warn(Path(folder) / "gnss.csv", repairs)
     return headings
 
 
-def _rows_in_frame(folder: Path | str) -> tuple[Array, LocalFrame]:
-    """Valid rows of `gnss.csv`, and the local frame of the first."""
-    rows, _ = _receiver_rows(Path(folder) / "gnss.csv")
-    return rows, LocalFrame(*(float(value) for value in rows[0, 1:4]))
+def _rows_in_frame(folder: Path | str) -> tuple[Array, LocalFrame, list[str]]:
+    """Valid rows of `gnss.csv`, the local frame of the first, and what is to be told of the others."""
+    path = Path(folder) / "gnss.csv"
+    rows, told = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, MORE_COLUMNS)
+    rows, invalid = fix_rows(rows, str(path))
+    told += [f"{n} rows dropped: {why}" for why, n in invalid.items()]
+    return rows, LocalFrame(*(float(value) for value in rows[0, 1:4])), told
 
 
-def _warn(path: Path, repairs: Repairs | None) -> None:
-    """Of rows that a reader of the caller dropped or sorted."""
+def _warn(path: Path, repairs: Repairs | None, told: Iterable[str] = ()) -> None:
+    """Of rows that a reader of the caller dropped or sorted, and what else is told."""
     if repairs is not None and (repairs.dropped or repairs.out_of_order):
-        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=3)
+        told = [*told, str(repairs)]
+    for message in told:
+        warnings.warn(f"{path}: {message}", RepairWarning, stacklevel=3)
+
+
+def _content(path: Path, expected: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MeasurementError(f"{path}: cannot be read ({error.strerror}); expected {expected}") from None
 
 
 def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:
@@ -121,13 +129,7 @@ def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:
     are there, stamp_s and std_e_m, std_n_m, std_u_m. Heights are above the ellipsoid. Raises MeasurementError as
     `surveyed_points.to_points` does, and for a row that is damaged.
     """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise MeasurementError(
-            f"{path}: cannot be read ({error.strerror}); expected a table of points"
-        ) from None
-    return parse_points(content, frame, str(path))
+    return parse_points(_content(Path(path), "a table of points"), frame, str(path))
 
 
 def parse_points(content: bytes, frame: LocalFrame, where: str) -> SurveyedPoints:
@@ -154,10 +156,9 @@ def read_wheels(folder: Path | str) -> WheelSpeeds | None:
     path = Path(folder) / "wheels.csv"
     if not path.exists():
         return None
-    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
+    rows, told = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
     wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
-    if repairs.dropped or repairs.out_of_order:
-        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    _warn(path, repairs, told)
     return wheels
 
 
@@ -187,22 +188,21 @@ def parse_numbers(
     longest_step_s: float,
     more: tuple[str, ...] = (),
     epoch_ns: int = 0,
+    told: list[str] | None = None,
 ) -> Array:
     """The named columns of a CSV file, whatever their order, (n, c), then those of `more`; the first is a stamp, s.
 
-    A cell without a value is NaN, and so is a column of `more` that is not there. Raises MeasurementError as
-    `parse_columns` does, and for stamps in another unit.
+    A cell without a value is NaN, and so is a column of `more` that is not there. Raises MeasurementError, and adds to
+    what is `told`, as `parse_columns` does; also raises it for stamps in another unit.
     """
     types = dict.fromkeys(columns, "float64")
-    table = parse_columns(content, types, where, epoch_ns, more, longest_step_s)
+    table = parse_columns(content, types, where, epoch_ns, more, longest_step_s, told)
     rows = np.full((table.num_rows, len(columns) + len(more)), np.nan)
     for k, name in enumerate([*columns, *more]):
         if name in table.column_names:
             rows[:, k] = table[name].to_numpy()
     if fault := unit_fault(rows[:, 0], longest_step_s):
-        raise MeasurementError(
-            f"{where}: {fault}; the name of the column may say so: stamp_ms, stamp_us, stamp_ns"
-        )
+        raise MeasurementError(f"{where}: {fault}; the column may be named so: stamp_ms, stamp_us, stamp_ns")
     return rows
 
 
@@ -213,12 +213,13 @@ def parse_columns(
     epoch_ns: int = 0,
     more: tuple[str, ...] = (),
     longest_step_s: float = np.inf,
+    told: list[str] | None = None,
 ) -> Table:
     """The named columns of a CSV file, each with its Arrow type; a damaged row has none of the damaged values.
 
     Columns of `more` are numbers that may be missing. Stamps that are dates count from `epoch_ns`, Unix ns; where no
-    unit is told, it is one in which their usual step is at most `longest_step_s`. How the table may be written:
-    `tables`. Raises MeasurementError for another table, and where most rows are damaged.
+    unit is told, it is one in which their usual step is at most `longest_step_s`, and that is added to what is `told`.
+    How the table may be written: `tables`. Raises MeasurementError for another table, and where most rows are damaged.
     """
     import pyarrow as pa
 
@@ -251,16 +252,14 @@ def parse_columns(
         table = repaired
     if table.num_rows == 0:
         raise MeasurementError(f"{where}: no rows; {expected}")
-    return _in_our_units(table, columns, kinds, epoch_ns, longest_step_s)
+    are_gps = STAMP in columns and layout.is_of_gps_time(columns[STAMP].at)
+    return _in_our_units(table, columns, kinds, epoch_ns, are_gps, longest_step_s, told)
 
 
 def _in_our_units(
-    table: Table,
-    columns: Mapping[str, Column],
-    kinds: Mapping[str, str],
-    epoch_ns: int,
-    longest_step_s: float,
-) -> Table:
+    table: Table, columns: Mapping[str, Column], kinds: Mapping[str, str], epoch_ns: int, are_gps: bool,
+    longest_step_s: float, told: list[str] | None,
+) -> Table:  # fmt: skip
     """The same table in SI units and degrees; stamps of several columns are one."""
     import pyarrow as pa
 
@@ -270,7 +269,7 @@ def _in_our_units(
             if "date" in columns:
                 days = table["date"].to_pylist()
                 texts = [f"{day} {text}" for day, text in zip(days, texts, strict=True)]
-            values = seconds_of_dates(texts, epoch_ns)
+            values = seconds_of_dates(texts, epoch_ns, are_gps)
         elif kinds[name] == "string" or (name != STAMP and column.is_in_our_units):
             continue
         else:
@@ -278,17 +277,21 @@ def _in_our_units(
             if name == STAMP and "stamp_ns" in columns and not (values % 1).any():
                 values = values + table["stamp_ns"].to_numpy().astype(np.float64) * 1e-9
             elif name == STAMP and not column.unit:
-                values = values * _scale_of(values, longest_step_s)
+                values = values * _scale_of(values, longest_step_s, told)
         table = table.set_column(table.column_names.index(name), name, pa.array(values))
     return table
 
 
-def _scale_of(stamps: Array, longest_step_s: float) -> float:
+def _scale_of(stamps: Array, longest_step_s: float, told: list[str] | None) -> float:
     """What stamps (n,) of an unknown unit are multiplied by to be seconds; 1 for numbers of rows."""
     scale = unix_scale(stamps)
     if scale != 1.0 or len(stamps) < 2 or np.nanmedian(np.diff(stamps)) == 1.0:
         return scale
     fitting = unit_of_steps(stamps, longest_step_s)
+    if fitting is not None and told is not None:
+        told.append(
+            f"stamps without a unit: taken as {fitting} by their steps; stamp_ms, stamp_us, stamp_ns say it"
+        )
     return scale if fitting is None else UNITS[fitting]
 
 
@@ -357,17 +360,10 @@ def _without_damage(layout: Layout, columns: Mapping[str, Column], types: Mappin
     return pa.table(values).take(pa.array(rows, mask=rows < 0))
 
 
-def _receiver_rows(path: Path) -> tuple[Array, dict[str, int]]:
-    return fix_rows(_numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, MORE_COLUMNS), str(path))
-
-
 def _numbers(
     path: Path, columns: tuple[str, ...], longest_step_s: float, more: tuple[str, ...] = ()
-) -> Array:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise MeasurementError(
-            f"{path}: cannot be read ({error.strerror}); expected a table with columns {','.join(columns)}"
-        ) from None
-    return parse_numbers(content, columns, str(path), longest_step_s, more)
+) -> tuple[Array, list[str]]:
+    """The rows of a file, and what is to be told of its stamps."""
+    told: list[str] = []
+    content = _content(path, f"a table with columns {','.join(columns)}")
+    return parse_numbers(content, columns, str(path), longest_step_s, more, told=told), told

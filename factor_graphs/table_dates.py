@@ -1,4 +1,4 @@
-"""Stamps of tables that are dates or times of a day, or Unix time in another unit than seconds."""
+"""Stamps of tables that are dates or times of a day, of UTC or of GPS, or Unix time in another unit than seconds."""
 
 from __future__ import annotations
 
@@ -18,6 +18,16 @@ DATE = re.compile(
     re.IGNORECASE,
 )
 """ISO 8601 and its neighbours, or a time of day alone; without a zone it is UTC."""
+GPS_TIME = re.compile(r"\bGPST\b|\bGPS[ _]?time\b", re.IGNORECASE)
+"""What says of dates that they are of GPS time."""
+ZONE = re.compile(r"(?:Z|UTC|GMT|[+-][0-9]{2}:?[0-9]{2})\s*$", re.IGNORECASE)
+"""How a date ends that tells its zone itself."""
+LEAPS_NS = np.array([
+    "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01",
+    "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01",
+    "2015-07-01", "2017-01-01",
+], "datetime64[ns]").astype(np.int64)  # fmt: skip
+"""The days from which UTC was one second more behind GPS time (IERS Bulletin C)."""
 MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 FIRST_YEAR, LAST_YEAR = 1900, 2199
 """Of nanoseconds in 64 bits."""
@@ -33,10 +43,16 @@ def are_dates(texts: Sequence[str]) -> bool:
     return DATE.fullmatch(first) is not None
 
 
-def seconds_of_dates(texts: Iterable[str | None], epoch_ns: int) -> Array:
+def gps_minus_utc_s(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Leap seconds (n,) at stamps of GPS time, ns since 1970 as if days had no leap seconds."""
+    at = LEAPS_NS + np.arange(1, len(LEAPS_NS) + 1) * 1_000_000_000
+    return np.asarray(np.searchsorted(at, stamps_ns, side="right"), np.int64)
+
+
+def seconds_of_dates(texts: Iterable[str | None], epoch_ns: int, are_gps: bool = False) -> Array:
     """Dates as seconds (n,) since an epoch, Unix ns; NaN for what is none.
 
-    Times alone are seconds of the first day.
+    Times alone are seconds of the first day. `are_gps`: they are of GPS time, ahead of UTC by the leap seconds.
     """
     found = [DATE.fullmatch(text or "") for text in texts]
     names = [one[1] for one in found if one is not None and one[1] is not None]
@@ -45,7 +61,7 @@ def seconds_of_dates(texts: Iterable[str | None], epoch_ns: int) -> Array:
         np.nan if one is None else _seconds(one, days.get(one[1]), epoch_ns) for one in found
     ])  # fmt: skip
     if names:
-        return seconds
+        return seconds - gps_minus_utc_s((np.nan_to_num(seconds) * 1e9).astype(np.int64) + epoch_ns) * are_gps
     known = np.isfinite(seconds)
     of_day = seconds[known]
     seconds[known] += DAY_S * np.cumsum(np.diff(of_day, prepend=of_day[:1]) < -DAY_S / 2)

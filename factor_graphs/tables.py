@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
+from factor_graphs.table_dates import GPS_TIME, ZONE
 
 HEADER_BYTES, HEADER_LINES, MAGIC_BYTES = 100_000, 100, 64
 MOST_COLUMNS, LONGEST_NAME = 1000, 200
@@ -127,6 +128,8 @@ class Layout:
     rows: memoryview
     separator: str = ","
     decimal: str = "."
+    above: str = ""
+    """What stands above the names."""
 
     @cached_property
     def _plain(self) -> list[list[tuple[str, str | None]]]:
@@ -176,8 +179,7 @@ class Layout:
                 yield Column(k, units.get(str(unit), 1.0), True)
             elif at_end == "" and plain + str(unit) not in WORDS:
                 raise MeasurementError(
-                    f"column {self.header[k][:50]!r} is in a unit that is not known; expected one of"
-                    f" {', '.join(units)}; without one, it is in the first"
+                    f"column {self.header[k][:50]!r} is in a unit that is not known; expected one of {', '.join(units)}"
                 )
             elif at_end in units:
                 yield Column(k, units[at_end], True)
@@ -191,6 +193,10 @@ class Layout:
         """The first cell of a column that has something; empty where there is none."""
         cells = (row[at].strip().strip('"') for row in self._head if at < len(row))
         return next((cell for cell in cells if cell), "")
+
+    def is_of_gps_time(self, at: int) -> bool:
+        """Whether the name of a column of dates, or what stands above the names, says that they are of GPS time."""
+        return bool(GPS_TIME.search(f"{self.header[at]}\n{self.above}")) and not ZONE.search(self.first(at))
 
     def missing(self, name: str, expected: Collection[str]) -> str:
         """Why a column is not there, and what to do."""
@@ -209,12 +215,10 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
     """How a table is written that has `wanted` columns, and perhaps some of `most`; of another, by its first line."""
     content = as_utf8(content)
     if b"\0" in content[:MAGIC_BYTES]:
-        raise MeasurementError(
-            "is no text (a spreadsheet, an archive, or another binary file); save it as CSV in UTF-8"
-        )
+        raise MeasurementError("is no text (a spreadsheet, an archive or the like); save it as CSV in UTF-8")
     lines = _decoded(content[:HEADER_BYTES]).split("\n")[:HEADER_LINES]
     at = _header_line(lines, wanted, most)
-    header, header_separator = _split(COMMENT.sub("", lines[at]))
+    above, (header, header_separator) = "\n".join(lines[:at]), _split(COMMENT.sub("", lines[at]))
     rest = [k for k in range(at + 1, len(lines)) if lines[k].strip() and not COMMENT.match(lines[k])]
     if rest and _are_units(lines[rest[0]]):
         header, at, rest = _with_units(lines[at], header, lines[rest[0]]), rest[0], rest[1:]
@@ -228,7 +232,7 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
     if separator == " ":
         by_tabs = b"\n".join(b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
         rows, separator = memoryview(by_tabs), "\t"
-    return Layout([*header, ""] if is_ended else header, rows, separator, decimal)
+    return Layout([*header, ""] if is_ended else header, rows, separator, decimal, above)
 
 
 def as_utf8(content: bytes) -> bytes:

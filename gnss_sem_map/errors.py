@@ -67,6 +67,17 @@ def errors_of_others(before: str, after: str = "", named: bool = False) -> Itera
         raise DataError(f"{before}{kind}{one_line(error)}{after}") from error
 
 
+@contextmanager
+def errors_of_measurements(before: str = "") -> Iterator[None]:
+    """Make a DataError, with the same message behind `before`, of what `factor_graphs` says of measurements."""
+    from factor_graphs.errors import MeasurementError
+
+    try:
+        yield
+    except MeasurementError as error:
+        raise DataError(f"{before}{error}") from None
+
+
 def how_to_install(extra: str) -> str:
     """What to type in a clone for an extra: it reaches the environment that runs, whether or not it is active."""
     return f"in the clone: {sys.executable} -m pip install -c constraints.txt -e '.[{extra}]'"

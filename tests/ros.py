@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from gnss_sem_map.datasets.ros.decoding import typestore
+from gnss_sem_map.datasets.ros.kinds import typestore
 
 START_NS = 1_780_000_000_000_000_000
 IMU, FIX, CLOUD = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/PointCloud2"

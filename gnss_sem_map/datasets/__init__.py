@@ -18,7 +18,7 @@ from typing import Any
 from factor_graphs.measurements import ImuSamples
 from gnss_sem_map.datasets.given_trajectory import along
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
+from gnss_sem_map.files.untrusted import inside, is_file, is_folder, refused, shown
 from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -41,22 +41,23 @@ def detect_format(drive: Path) -> str:
         if drive.suffix.lower() in endings:
             return endings[drive.suffix.lower()]
         more = "; unpack it" if drive.suffix.lower() in ARCHIVES else ""
-        raise DataError(
-            f"{shown(drive)}: found a file, expected the folder of a drive, or a file ending in"
-            f" {', '.join(endings)}{more}"
+        raise refused(
+            drive,
+            f"found a file, expected a folder, or one ending in {', '.join(endings)}{more}",
         )
     if not is_folder(drive):
-        raise DataError(f"{shown(drive)}: no such folder; expected a drive")
+        raise refused(drive, "no such folder; expected a drive")
     fitting = [name for name, reader in readers().items() if reader.is_drive(drive)]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
-        raise DataError(f"{shown(drive)}: looks like {' and '.join(fitting)}; choose one with --format")
+        raise refused(drive, f"looks like {' and '.join(fitting)}; choose one with --format")
     if offered := drives_in(drive):
         more = f" and {len(offered) - MOST_OFFERED} more" if len(offered) > MOST_OFFERED else ""
-        raise DataError(
-            f"{shown(drive)}: no drive, but a folder of drives; give one of them, or several:"
-            f" {', '.join(shown(path) for path in offered[:MOST_OFFERED])}{more}"
+        raise refused(
+            drive,
+            f"a folder of drives; give one of them, or several:"
+            f" {', '.join(shown(path) for path in offered[:MOST_OFFERED])}{more}",
         )
     found = [shown(path.name) for path in inside(drive)][:8]
     signs = ", or ".join(f"{reader.SIGNS}" for reader in readers().values())
@@ -64,7 +65,7 @@ def detect_format(drive: Path) -> str:
     way = (
         f"; unpack {', '.join(packed)}" if packed else "; other data: write a CSV log (docs/your_own_log.md)"
     )
-    raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}{way}")
+    raise refused(drive, f"no drive of a known format; found {found}, expected {signs}{way}")
 
 
 def archives_in(folder: Path) -> list[str]:
@@ -118,11 +119,11 @@ def read_imu(drive: Path, drive_format: str | None = None) -> tuple[ImuSamples, 
         return found
     log: SensorLog = reader.read(drive, True)
     if log.imu is None:
-        raise DataError(f"{shown(drive)}: has no IMU, only poses; expected a log with the samples of an IMU")
+        raise refused(drive, "has no IMU, only poses; expected a log with the samples of an IMU")
     return log.imu, log.conventions or SensorConventions()
 
 
 def _reader(drive: Path, drive_format: str | None) -> Any:
     if drive_format is not None and drive_format not in readers():
-        raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")
+        raise refused(drive, f"found format {drive_format!r}, expected one of {sorted(readers())}")
     return readers()[drive_format or detect_format(drive)]

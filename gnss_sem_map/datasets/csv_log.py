@@ -22,8 +22,6 @@ Stamps are seconds on one clock. With a trajectory in a file of its own, lidar/ 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -47,16 +45,33 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuSamples, WheelSpeeds, clean_imu, clean_wheels
 from factor_graphs.receiver_rows import MORE_COLUMNS
 from factor_graphs.surveyed_points import SurveyedPoints
-from factor_graphs.tables import Column, layout_of
+from factor_graphs.tables import layout_of
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
+from gnss_sem_map.datasets.gnss_files.positions import Receiver, measured
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
-from gnss_sem_map.datasets.point_times import leave_out_of_sweep
-from gnss_sem_map.datasets.receiver import Receiver, measured
-from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import inside, is_file, is_folder, read_bytes, shown
-from gnss_sem_map.sensor_log import POSE_OF_LIDAR, SENSOR, Image, Lidar, Points, Scan, SensorLog, Skip
+from gnss_sem_map.datasets.stamps import (
+    LONGEST_FRAME_STEP_S,
+    check_date,
+    check_unit,
+    in_order,
+    leave_out_of_sweep,
+)
+from gnss_sem_map.errors import DataError, errors_of_measurements
+from gnss_sem_map.files.pictures import read_picture
+from gnss_sem_map.files.untrusted import expect_file, inside, is_file, is_folder, read_bytes, refused, shown
+from gnss_sem_map.sensor_log import (
+    POSE_OF_LIDAR,
+    SENSOR,
+    Image,
+    Lidar,
+    Points,
+    Scan,
+    SensorLog,
+    Skip,
+    repaired,
+    skipped,
+)
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -127,19 +142,19 @@ def read_imu(drive: Path) -> tuple[ImuSamples, SensorConventions]:
 def _imu(path: Path, about: LogFile) -> tuple[ImuSamples | None, list[Skip]]:
     if not is_file(path):
         return None, [_missing(path, IMU_COLUMNS)]
-    rows = _numbers(path, IMU_COLUMNS, LONGEST_IMU_STEP_S, about)
-    with _as_data_error():
+    with errors_of_measurements():
+        rows, skips = _numbers(path, IMU_COLUMNS, LONGEST_IMU_STEP_S, about)
         imu, repairs = clean_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
     check_date(float(imu.stamps[-1]), about.epoch_ns, shown(path))
-    return imu, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
+    return imu, skips + repaired(path, repairs)
 
 
 def _receiver(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Receiver, list[Skip]]:
     path = drive / "gnss.csv"
     if about.gnss_file is None and not is_file(path):
         return Receiver(), [_missing(path, GNSS_COLUMNS)]
-    rows, skips = _fix_rows(drive, about, imu_stamps)
-    with _as_data_error():
+    with errors_of_measurements():
+        rows, skips = _fix_rows(drive, about, imu_stamps)
         found, lost = measured(rows, shown(path), about.baseline)
     return found, [*lost, *skips]
 
@@ -150,31 +165,26 @@ def _missing(path: Path, columns: tuple[str, ...]) -> Skip:
 
 def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Array, list[Skip]]:
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
-    path, skips, file = drive / "gnss.csv", list[Skip](), about.gnss_file
+    path, file = drive / "gnss.csv", about.gnss_file
     if file is not None and is_file(path) and file.path != path.name:
-        raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
+        raise refused(path, "there is a gnss_file in log.yaml as well; remove one of the two")
     if file is None and not _is_of_our_columns(path):
         file = GnssFile(path=path.name)
     if file is None:
-        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
+        given, skips = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
     else:
-        path = drive / file.path
-        span_ns = None
+        path, span_ns = drive / file.path, None
         if imu_stamps is not None:
             first, last = about.epoch_ns + np.round(imu_stamps[[0, -1]] * 1e9).astype(np.int64)
             span_ns = int(first), int(last)
         try:
             found = read_gnss_file(file, drive, about.epoch_ns, span_ns)
         except DataError as error:
-            if about.gnss_file is not None:
-                raise
-            raise DataError(
-                f"{error}; such keys are of `gnss_file: {{path: {path.name}}}` in log.yaml"
-            ) from None
+            keys = f"; such keys are of `gnss_file: {{path: {path.name}}}` in log.yaml"
+            raise DataError(f"{error}{'' if about.gnss_file else keys}") from None
         given, skips = found.rows, found.skips
-    with _as_data_error():
-        rows, invalid = fix_rows(given, shown(path))
-    return rows, skips + [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
+    rows, invalid = fix_rows(given, shown(path))
+    return rows, skips + skipped("fix", path, "rows", invalid)
 
 
 def _is_of_our_columns(path: Path) -> bool:
@@ -193,53 +203,38 @@ def _wheels(path: Path, about: LogFile) -> tuple[WheelSpeeds | None, list[Skip]]
     """Wheel speeds and the skipped rows; None where there is no such table."""
     if not is_file(path):
         return None, []
-    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S, about)
-    wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
-    return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
+    with errors_of_measurements():
+        rows, skips = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S, about)
+        wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
+    return wheels, skips + repaired(path, repairs)
 
 
 def _points(path: Path, frame: LocalFrame) -> SurveyedPoints | None:
     """Surveyed points; None where there is no such table."""
     if not is_file(path):
         return None
-    with _as_data_error():
+    with errors_of_measurements():
         return parse_points(read_bytes(path, MOST_TABLE_BYTES), frame, shown(path))
 
 
 def _numbers(
     path: Path, columns: tuple[str, ...], longest_step_s: float, about: LogFile, more: tuple[str, ...] = ()
-) -> Array:
-    """The named columns of a CSV file, whatever their order: (n, c), as `parse_numbers` has them."""
-    with _as_data_error():
-        content = _content(path, columns)
-        for name, key in UNIT_KEYS.items():
-            column = _column(content, columns, name, shown(path)) if name in columns else None
-            if column is not None and column.scale != 1.0 and getattr(about, key) is not None:
-                raise DataError(
-                    f"{shown(path)}: the unit of {name} is in its header, and {key} in log.yaml; remove {key}"
-                )
-        return parse_numbers(content, columns, shown(path), longest_step_s, more, about.epoch_ns)
-
-
-def _column(content: bytes, columns: tuple[str, ...], name: str, where: str) -> Column | None:
-    try:
-        return layout_of(content, columns).column(name)
-    except MeasurementError as error:
-        raise DataError(f"{where}: {error}") from None
+) -> tuple[Array, list[Skip]]:
+    """The named columns of a CSV file, (n, c) as `parse_numbers` has them, and what is to be told of its stamps."""
+    content, told, where = _content(path, columns), list[str](), shown(path)
+    for name in (name for name in UNIT_KEYS if name in columns):
+        with errors_of_measurements(f"{where}: "):
+            column = layout_of(content, columns).column(name)
+        if column is not None and column.scale != 1.0 and getattr(about, UNIT_KEYS[name]) is not None:
+            key = UNIT_KEYS[name]
+            raise refused(where, f"the unit of {name} is in its header, and {key} in log.yaml; remove {key}")
+    rows = parse_numbers(content, columns, where, longest_step_s, more, about.epoch_ns, told)
+    return rows, [Skip("unit", where, text, len(rows)) for text in told]
 
 
 def _content(path: Path, columns: tuple[str, ...]) -> bytes:
-    if not is_file(path):
-        raise DataError(f"{shown(path)}: missing; expected a table with columns {','.join(columns)}")
+    expect_file(path, f"a table with columns {','.join(columns)}")
     return read_bytes(path, MOST_TABLE_BYTES)
-
-
-@contextmanager
-def _as_data_error() -> Iterator[None]:
-    try:
-        yield
-    except MeasurementError as error:
-        raise DataError(str(error)) from None
 
 
 def _stamps(path: Path, what: str, epoch_ns: int) -> tuple[dict[int, float], list[Skip]]:
@@ -247,19 +242,15 @@ def _stamps(path: Path, what: str, epoch_ns: int) -> tuple[dict[int, float], lis
 
     A number may have 19 digits: it is never a floating number.
     """
-    columns = {"number": "string", "stamp_s": "float64"}
-    with _as_data_error():
+    columns, told = {"number": "string", "stamp_s": "float64"}, list[str]()
+    with errors_of_measurements():
         table = parse_columns(
-            _content(path, tuple(columns)),
-            columns,
-            shown(path),
-            epoch_ns,
-            longest_step_s=LONGEST_FRAME_STEP_S,
+            _content(path, tuple(columns)), columns, shown(path), epoch_ns, (), LONGEST_FRAME_STEP_S, told
         )
     texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
     check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
+    skips = [Skip("unit", shown(path), text, len(texts)) for text in told]
     stamps: dict[int, float] = {}
-    skips = []
     for line, (text, stamp) in enumerate(zip(texts, seconds.tolist(), strict=True), 2):
         number = _whole(text or "")
         if number is None or not np.isfinite(stamp):
@@ -269,7 +260,7 @@ def _stamps(path: Path, what: str, epoch_ns: int) -> tuple[dict[int, float], lis
         else:
             stamps[number] = stamp
     if not stamps:
-        raise DataError(f"{shown(path)}: found no whole number with a stamp among {len(texts)} rows")
+        raise refused(path, f"found no whole number with a stamp among {len(texts)} rows")
     return stamps, skips
 
 
@@ -284,24 +275,21 @@ def _whole(text: str) -> int | None:
 
 def _stamped(
     what: str, folder: Path, epoch_ns: int, *suffixes: str
-) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
-    """Number, stamp and file of every frame that has a stamp and a file; and the skipped frames."""
+) -> tuple[list[tuple[int, Path, float]], list[Skip]]:
+    """Number, file and stamp of every frame that has a stamp and a file; and the skipped frames."""
     found = frames.numbered(what, folder, *suffixes)
-    if not found.files and is_folder(folder) and (n := sum(path.name != STAMPS for path in inside(folder))):
-        endings = sorted({path.suffix for path in inside(folder) if path.name != STAMPS} - {*suffixes})[:5]
+    others = [path for path in (inside(folder) if is_folder(folder) else []) if path.name != STAMPS]
+    if not found.files and others:
+        endings = sorted({path.suffix for path in others} - {*suffixes})[:5]
         name = f"{what}s are named by their numbers, such as 0000000007{suffixes[0]}"
-        others, way = (f" ({', '.join(endings)})", HOW_TO_WRITE[what]) if endings else ("", "")
-        found.skips.append(Skip(what, shown(folder), f"found {n} others{others}; {name}{way}", n))
+        told, way = (f" ({', '.join(endings)})", HOW_TO_WRITE[what]) if endings else ("", "")
+        reason = f"found {len(others)} others{told}; {name}{way}"
+        found.skips.append(Skip(what, shown(folder), reason, len(others)))
     if not found.files and not is_file(folder / STAMPS):
         return [], found.skips
     stamps, skips = _stamps(folder / STAMPS, what, epoch_ns)
-    skips += [
-        Skip(what, shown(path), "no stamp for this frame")
-        for number, path in found.files.items()
-        if number not in stamps
-    ]
-    skips += found.skips + frames.missing(what, folder, stamps, found.files)
-    return [(number, stamps[number], path) for number, path in found.files.items() if number in stamps], skips
+    joined, lost = found.joined(stamps)
+    return joined, skips + lost
 
 
 def _lidars(drive: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]]:
@@ -323,7 +311,7 @@ def _scans(folder: Path, about: LidarFile, epoch_ns: int) -> tuple[tuple[Scan, .
     found, skips = _stamped("scan", folder, epoch_ns, *frames.SCAN_SUFFIXES)
     scans = [
         Scan(path.stem, n, t, partial(_read_scan, path, t, about, frames.state_of(path)))
-        for n, t, path in found
+        for n, path, t in found
     ]
     return in_order("scan", scans, skips), skips
 
@@ -344,10 +332,11 @@ def _check_columns(rows: NDArray[np.float32], where: str) -> None:
     """Raise DataError for numbers in rows of another length: coordinates fall into the column of intensities."""
     negative = float((rows[:, 3] < 0).mean())
     if negative > MOST_NEGATIVE:
-        raise DataError(
-            f"{where}: {negative:.0%} of the intensities are below zero: are these rows of another count of columns?"
+        raise refused(
+            where,
+            f"{negative:.0%} of the intensities are below zero: are these rows of another count of columns?"
             f" expected {rows.shape[1]}, x y z intensity{'' if rows.shape[1] == 4 else ' time'}; lidar_is_compensated"
-            " in log.yaml (is_compensated in lidars) says whether there are times"
+            " in log.yaml (is_compensated in lidars) says whether there are times",
         )
 
 
@@ -365,7 +354,7 @@ def _images(
     for place, camera in places:
         size, name = (None, "") if camera is None else (camera.image_size, camera.name)
         found, lost = _stamped("image", place, about.epoch_ns, *frames.IMAGE_SUFFIXES)
-        of_camera = [Image(n, t, partial(frames.read_image, path, size), name) for n, t, path in found]
+        of_camera = [Image(n, t, partial(read_picture, path, size), name) for n, path, t in found]
         images += in_order("image", of_camera, lost)
         skips += lost
         if camera is None and found:

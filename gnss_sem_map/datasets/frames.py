@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.pictures import read_picture
-from gnss_sem_map.files.untrusted import inside, is_folder, open_file, reason, shown, status
+from gnss_sem_map.files.untrusted import inside, is_folder, open_file, reason, refused, shown, status
 from gnss_sem_map.sensor_log import Skip
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -26,7 +27,10 @@ NO_POINTS, EVERY = 0.1, 8
 """A file with a larger share of points out of these bounds is no scan: of random bytes, nine in ten coordinates are
 out of bounds. Every eighth point is tested."""
 LARGEST_NUMBER = 2**63 - 1
+OF_KITTI = ("data", "data_rgb", "data_rect")
+"""Folders of files within that of a sensor, by which it is named."""
 
+T = TypeVar("T")
 State = tuple[int, int]
 """Size in bytes and time of the last change, ns, of a file."""
 
@@ -35,8 +39,29 @@ State = tuple[int, int]
 class Frames:
     """The files of a folder by frame number, in order, and the skipped ones."""
 
+    what: str
+    folder: Path
     files: dict[int, Path]
     skips: list[Skip]
+
+    def joined(
+        self, stamps: Mapping[int, T], why: str = "no stamp for this frame"
+    ) -> tuple[list[tuple[int, Path, T]], list[Skip]]:
+        """Number, file and stamp of the frames that have both; a skip for each other file, and run of other stamps."""
+        skips = [*self.skips, *self.missing(stamps)]
+        skips += [Skip(self.what, shown(path), why) for n, path in self.files.items() if n not in stamps]
+        return [(n, path, stamps[n]) for n, path in self.files.items() if n in stamps], skips
+
+    def missing(self, known: Iterable[int]) -> list[Skip]:
+        """One skip for every run of known frames without a file."""
+        folder = self.folder.parent if self.folder.name in OF_KITTI else self.folder
+        absent = sorted(set(known) - set(self.files))
+        breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
+        runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
+        return [
+            Skip(self.what, f"{shown(folder)}: frames {a[0]} to {a[-1]}", f"{len(a)} files missing", len(a))
+            for a in runs
+        ]
 
 
 def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
@@ -46,7 +71,7 @@ def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
     folder that cannot be listed.
     """
     if not is_folder(folder):
-        return Frames({}, [])
+        return Frames(what, folder, {}, [])
     of_kind = [path for path in inside(folder) if path.suffix.lower() in suffixes and path.stem.isdecimal()]
     files: dict[int, Path] = {}
     skips = []
@@ -58,7 +83,7 @@ def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
             skips.append(Skip(what, shown(path), f"frame {number} has another file, {files[number].name}"))
         else:
             files[number] = path
-    return Frames(dict(sorted(files.items())), skips)
+    return Frames(what, folder, dict(sorted(files.items())), skips)
 
 
 def state_of(path: Path) -> State | None:
@@ -79,24 +104,20 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
         found = os.fstat(file.fileno())
         size = found.st_size
         if state is not None and state != (size, found.st_mtime_ns):
-            raise DataError(
-                f"{shown(path)}: changed while the drive was read; found {size} bytes, once {state[0]}"
-            )
+            raise refused(path, f"changed while the drive was read; found {size} bytes, once {state[0]}")
         if size > 4 * columns * MOST_POINTS:
-            raise DataError(
-                f"{shown(path)}: found {size} bytes, more than {MOST_POINTS} points; is it a scan?"
-            )
+            raise refused(path, f"found {size} bytes, more than {MOST_POINTS} points; is it a scan?")
         try:
             if path.suffix.lower() == ".txt":
                 return _rows_of_text(file.readall(), columns, path)
             rows = np.empty((size // (4 * columns), columns), "<f4")
             if size == 0 or size != rows.nbytes or file.readinto(rows.data) != size:
-                raise DataError(
-                    f"{shown(path)}: truncated scan, or another count of columns; found {size} bytes, expected a"
-                    f" multiple of {4 * columns} ({columns} columns) and more than 0"
+                raise refused(
+                    path,
+                    f"truncated scan; found {size} bytes, expected {columns} columns of 4 bytes",
                 )
         except OSError as error:
-            raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None
+            raise refused(path, f"cannot read it ({reason(error)})") from None
     refuse_other_bytes(rows, shown(path))
     return rows
 
@@ -108,13 +129,9 @@ def _rows_of_text(content: bytes, columns: int, path: Path) -> NDArray[np.float3
             np.loadtxt(lines, np.float32, comments=None, ndmin=2) if lines else np.empty((0, 0), np.float32)
         )
     except ValueError as error:
-        raise DataError(
-            f"{shown(path)}: no rows of {columns} numbers ({' '.join(str(error).split())[:100]})"
-        ) from None
+        raise refused(path, f"no rows of {columns} numbers ({' '.join(str(error).split())[:100]})") from None
     if rows.shape[1] != columns:
-        raise DataError(
-            f"{shown(path)}: found {rows.shape[1]} numbers per line, expected {columns}; is it truncated?"
-        )
+        raise refused(path, f"found {rows.shape[1]} numbers per line, expected {columns}; is it truncated?")
     refuse_other_bytes(rows, shown(path))
     return rows
 
@@ -123,7 +140,7 @@ def first_size(files: Iterable[Path]) -> tuple[int, int] | None:
     """(width, height) of the first image that can be read."""
     for path in files:
         try:
-            height, width = read_image(path, None).shape[:2]
+            height, width = read_picture(path).shape[:2]
         except DataError:
             continue
         return width, height
@@ -136,9 +153,9 @@ def refuse_other_bytes(rows: NDArray[np.float32], where: str) -> None:
     out = ((sizes > FARTHEST_M) & np.isfinite(sizes)) | ((sizes < NEAREST_M) & (sizes > 0))
     share = float(out.any(axis=0).mean())
     if share > NO_POINTS:
-        raise DataError(
-            f"{where}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within"
-            f" {NEAREST_M:g} m of zero, expected metres; are these other bytes, another count of columns, or mm?"
+        raise refused(
+            where,
+            f"no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m, or in zero; other columns, or mm?",
         )
 
 
@@ -148,19 +165,3 @@ def scale_intensity(rows: NDArray[np.float32], intensity_max: float) -> None:
         with np.errstate(over="ignore", invalid="ignore"):  # of damaged points
             rows[:, 3] = rows[:, 3] / np.float64(intensity_max)
     np.copyto(rows[:, 3], 0.0, where=np.isnan(rows[:, 3]))
-
-
-def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """RGB pixels (h, w, 3); raises DataError for a damaged file or another (width, height) than the calibration's."""
-    return read_picture(path, size)
-
-
-def missing(what: str, folder: Path, known: Iterable[int], files: dict[int, Path]) -> list[Skip]:
-    """One skip for every run of known frames without a file."""
-    absent = sorted(set(known) - set(files))
-    breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
-    runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
-    return [
-        Skip(what, f"{shown(folder)}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing", len(run))
-        for run in runs
-    ]

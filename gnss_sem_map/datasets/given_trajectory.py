@@ -21,10 +21,10 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.given_poses import do_fit, misses, pose_by_fixes, turns_seen
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets.gnss_files import sbet
-from gnss_sem_map.datasets.kitti_odometry import read_table
+from gnss_sem_map.datasets.kitti_calibration import read_table
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.run_json import read_run
-from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.files.untrusted import is_file, refused, shown
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -61,7 +61,7 @@ def along(log: SensorLog, file: Path, with_imu: bool = True) -> SensorLog:
     found = _read(file, log.epoch_ns + round((first + last) / 2 * 1e9))
     trajectory, clock = _on_clock_of(ours, found, file)
     if len(trajectory) < 2:
-        raise DataError(f"{shown(file)}: found one pose, expected at least 2")
+        raise refused(file, "found one pose, expected at least 2")
     if with_imu and file.suffix not in (".parquet", *SBET):
         _refuse_scalar_first(trajectory, ours, file)
     frame, trajectory, place = _placed(ours, trajectory, found.frame)
@@ -72,7 +72,7 @@ def along(log: SensorLog, file: Path, with_imu: bool = True) -> SensorLog:
 
 def _read(file: Path, near_ns: int) -> _File:
     if not is_file(file):
-        raise DataError(f"{shown(file)}: no such file; expected a trajectory (.tum, .parquet, .sbet)")
+        raise refused(file, "no such file; expected a trajectory (.tum, .parquet, .sbet)")
     if file.suffix in SBET:
         stamps_ns, geodetic, R_local_imu = sbet.read_poses(file, near_ns)
         frame = LocalFrame(*(float(value) for value in geodetic[0]))
@@ -88,9 +88,7 @@ def _read(file: Path, near_ns: int) -> _File:
         origin = about["local_frame"]
         return _File(trajectory, int(about["epoch_ns"]), None if origin is None else LocalFrame(**origin))
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{shown(file.parent / 'run.json')}: damaged ({type(error).__name__} {error})"
-        ) from None
+        raise refused(file.parent / "run.json", f"damaged ({type(error).__name__} {error})") from None
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -107,9 +105,10 @@ def read_tum(path: Path) -> Trajectory:
     for what, wrong in faults.items():
         if wrong.any():
             row = int(wrong.argmax())
-            raise DataError(
-                f"{shown(path)}: pose {row + 1}, at {stamps[row]:.15g} s: found {what}; {wrong.sum()} of"
-                f" {len(rows)} poses have this fault"
+            raise refused(
+                path,
+                f"pose {row + 1}, at {stamps[row]:.15g} s: found {what}; {wrong.sum()} of"
+                f" {len(rows)} poses have this fault",
             )
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4]
@@ -122,9 +121,7 @@ def _span(log: SensorLog) -> tuple[float, float]:
     tables = [table.stamps for table in (log.imu, log.gnss) if table is not None]
     stamps = np.array(of_scans) if of_scans else np.concatenate([np.empty(0), *tables])
     if not len(stamps):
-        raise DataError(
-            f"{log.name}: found neither scans nor IMU nor GNSS; expected some, to go with the poses"
-        )
+        raise DataError(f"{log.name}: found neither scans nor IMU nor GNSS to go with the poses")
     return float(stamps.min()), float(stamps.max())
 
 
@@ -140,10 +137,11 @@ def _on_clock_of(log: SensorLog, found: _File, file: Path) -> tuple[Trajectory, 
     how = max(common, key=lambda each: common[each])
     zero = clocks[how]
     if common[how] < 0:
-        raise DataError(
-            f"{shown(file)}: its poses are from {poses.start - zero:.3f} to {poses.end - zero:.3f} s, and {log.name} is"
+        raise refused(
+            file,
+            f"its poses are from {poses.start - zero:.3f} to {poses.end - zero:.3f} s, and {log.name} is"
             f" from {first:.3f} to {last:.3f} s after {log.epoch_ns * 1e-9:.3f}, Unix time: no time in common; is it of"
-            " another drive?"
+            " another drive?",
         )
     return replace(poses, stamps=poses.stamps - zero) if zero else poses, how
 
@@ -165,9 +163,9 @@ def _refuse_scalar_first(trajectory: Trajectory, log: SensorLog, file: Path) -> 
         is_other = _plausibility(trajectory) < POSSIBLE and _plausibility(other) > SURE
         why = "the vehicle drives forward and upright"
     if is_other:
-        raise DataError(
-            f"{shown(file)}: the file looks like qw first: read so, {why}; expected stamp tx ty tz qx qy qz qw, so"
-            " move the fifth number of each line to its end"
+        raise refused(
+            file,
+            f"looks like qw first: read so, {why}; expected qw last, in stamp tx ty tz qx qy qz qw",
         )
 
 

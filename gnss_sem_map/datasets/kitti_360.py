@@ -17,7 +17,6 @@ trajectory.
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +25,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.datasets import frames, kitti_calibration, kitti_oxts, kitti_raw, kitti_stamps
-from gnss_sem_map.datasets.kitti_odometry import read_table
+from gnss_sem_map.datasets import frames, kitti_calibration, kitti_oxts, kitti_raw
+from gnss_sem_map.datasets.kitti_calibration import read_table
 from gnss_sem_map.datasets.stamps import in_order
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import MOST_YAML_BYTES, fault_of, parse_yaml
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, shown
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, refused, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
 
@@ -91,9 +89,9 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     """Open a KITTI-360 drive; raises DataError when calibration, stamps or poses are missing or malformed."""
     root, name = _root(drive), drive.resolve().name
     about, poses = root / "calibration", root / "data_poses" / name
-    stamps_ns, skips = kitti_stamps.stamps_ns(drive / "velodyne_points" / "timestamps.txt")
+    stamps_ns, skips = kitti_calibration.stamps_ns(drive / "velodyne_points" / "timestamps.txt")
     if not stamps_ns:
-        raise DataError(f"{shown(drive / 'velodyne_points' / 'timestamps.txt')}: found no stamp")
+        raise refused(drive / "velodyne_points" / "timestamps.txt", "found no stamp")
     unit = None
     if is_folder(poses / "oxts"):
         twin = name.replace("_sync", "_extract")
@@ -104,7 +102,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     epoch_ns = unit.epoch_ns if unit else min(stamps_ns.values())
     frame, track = _poses(poses / "poses.txt", stamps_ns, epoch_ns, unit.frame if unit else None)
     if unit is None and track is None:
-        raise DataError(f"{shown(poses)}: found neither oxts nor poses.txt; expected one of them")
+        raise refused(poses, "found neither oxts nor poses.txt; expected one of them")
     scans, scan_skips = _scans(drive / "velodyne_points", stamps_ns, epoch_ns)
     names = [camera for camera in IMAGES if is_folder(root / "data_2d_raw" / name / camera / IMAGES[camera])]
     calibration = _calibration(about, names)
@@ -131,19 +129,11 @@ def _root(drive: Path) -> Path:
 
 
 def _scans(folder: Path, stamps_ns: dict[int, int], epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
-    found = frames.numbered("scan", folder / "data", ".bin")
-    skips = found.skips + frames.missing("scan", folder, stamps_ns, found.files)
+    found, skips = frames.numbered("scan", folder / "data", ".bin").joined(stamps_ns)
     steps = np.diff(sorted(stamps_ns.values())) * 1e-9
     half = 0.5 * (float(np.median(steps)) if len(steps) else USUAL_SWEEP_S)
-    scans = []
-    for number, path in found.files.items():
-        if number not in stamps_ns:
-            skips.append(Skip("scan", shown(path), "no stamp for this frame"))
-            continue
-        stamp = (stamps_ns[number] - epoch_ns) * 1e-9
-        sweep = (stamp - half, stamp + half)
-        read_it = partial(kitti_raw.read_sweep, path, stamp, *sweep, frames.state_of(path))
-        scans.append(Scan(path.stem, number, stamp, read_it, sweep))
+    timed = ((n, path, (ns - epoch_ns) * 1e-9) for n, path, ns in found)
+    scans = [kitti_raw.scan_of(path, n, stamp, stamp - half, stamp + half) for n, path, stamp in timed]
     return in_order("scan", scans, skips), skips
 
 
@@ -154,9 +144,7 @@ def _images(
     skips: list[Skip] = []
     for name, camera in zip(names, calibration.cameras, strict=True):
         found = frames.numbered("image", folder / name / IMAGES[name], *frames.IMAGE_SUFFIXES)
-        of_camera, lost = kitti_raw.stamped_images(
-            found, folder / name, epoch_ns, camera.image_size, camera.name, of_scans
-        )
+        of_camera, lost = kitti_raw.stamped_images(found, epoch_ns, camera.image_size, camera.name, of_scans)
         images += of_camera
         skips += lost
     return tuple(sorted(images, key=lambda image: image.stamp)), skips
@@ -164,9 +152,8 @@ def _images(
 
 def _calibration(folder: Path, names: list[str]) -> Calibration:
     """Pose of the LiDAR, and the cameras of these names; an only one has none."""
-    file = folder / "calib_cam_to_pose.txt"
-    rows = kitti_calibration.read_rows(file, dict.fromkeys(IMAGES, 12))
-    T_pose_camera = {name: _rigid(row, f"{shown(file)}: {name}") for name, row in rows.items()}
+    to_pose = kitti_calibration.CalibrationFile(folder / "calib_cam_to_pose.txt", dict.fromkeys(IMAGES, 12))
+    T_pose_camera = {name: kitti_calibration.exact(to_pose.pose(name)) for name in IMAGES}
     file = folder / "calib_cam_to_velo.txt"
     T_lidar_camera0 = _rigid(read_table(file, 12)[0], shown(file))
     T_imu_lidar = T_IMU_POSE @ T_pose_camera["image_00"] @ np.linalg.inv(T_lidar_camera0)
@@ -184,29 +171,21 @@ def _calibration(folder: Path, names: list[str]) -> Calibration:
 
 
 def _rigid(row: Array, where: str) -> Array:
-    """A (4, 4) transform from twelve numbers, row by row."""
-    T = row.reshape(3, 4)
-    return kitti_calibration.exact(kitti_calibration.transform(T[:, :3], T[:, 3], where))
+    return kitti_calibration.exact(kitti_calibration.transform(row, where))
 
 
 def _rectified(file: Path, number: str) -> tuple[Array, Array, tuple[int, int]]:
     """The rotation (4, 4) that rectifies a camera, K, and (width, height)."""
-    rows = kitti_calibration.read_rows(
-        file, {f"R_rect_{number}": 9, f"P_rect_{number}": 12, f"S_rect_{number}": 2}
-    )
-    R_rect = kitti_calibration.transform(
-        rows[f"R_rect_{number}"], np.zeros(3), f"{shown(file)}: R_rect_{number}"
-    )
+    R, P, S = (f"{name}_rect_{number}" for name in "RPS")
+    about = kitti_calibration.CalibrationFile(file, {R: 9, P: 12, S: 2})
     # the shift in P is that between the two cameras, which their poses have already
-    K, _ = kitti_calibration.split_projection(rows[f"P_rect_{number}"], f"{shown(file)}: P_rect_{number}")
-    size = kitti_calibration.image_size(rows[f"S_rect_{number}"], f"{shown(file)}: S_rect_{number}")
-    return kitti_calibration.exact(R_rect), K, size
+    return kitti_calibration.exact(about.pose(R)), about.projection(P)[0], about.size(S)
 
 
 def _fisheye(file: Path) -> tuple[Array, tuple[int, int], Distortion]:
     """K, (width, height) and lens of a fisheye, from a file as OpenCV writes it."""
     if not is_file(file):
-        raise DataError(f"{shown(file)}: missing calibration file; its images are there")
+        raise refused(file, "missing calibration file; its images are there")
     text = re.sub(r"^%YAML[^\n]*\n", "", read_text(file, MOST_YAML_BYTES))
     try:
         about = FisheyeFile.model_validate(parse_yaml(re.sub(r":(?=[^\s])", ": ", text)))
@@ -214,9 +193,9 @@ def _fisheye(file: Path) -> tuple[Array, tuple[int, int], Distortion]:
         coefficients = (bent.k1, bent.k2, bent.p1, bent.p2)
         lens = Distortion(model="mei", coefficients=coefficients, xi=about.mirror_parameters.xi)
     except ValidationError as error:
-        raise DataError(f"{shown(file)}: {fault_of(error)}; expected the model of Mei") from None
+        raise refused(file, f"{fault_of(error)}; expected the model of Mei") from None
     except ValueError as error:
-        raise DataError(f"{shown(file)}: not YAML ({error})") from None
+        raise refused(file, f"not YAML ({error})") from None
     K = np.array([[projected.gamma1, 0, projected.u0], [0, projected.gamma2, projected.v0], [0, 0, 1.0]])
     return K, (about.image_width, about.image_height), lens
 
@@ -231,9 +210,9 @@ def _poses(
     rows = rows[np.isin(rows[:, 0], list(stamps_ns))]
     stamps = np.array([(stamps_ns[int(number)] - epoch_ns) * 1e-9 for number in rows[:, 0]])
     if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
-        raise DataError(
-            f"{shown(file)}: found {len(stamps)} poses of frames with a stamp, expected at least 2, in the order of"
-            " their frames"
+        raise refused(
+            file,
+            f"found {len(stamps)} poses of frames with a stamp, expected 2 or more in order",
         )
     T_world_pose = np.stack([_rigid(row, f"{shown(file)}: frame {row[0]:g}") for row in rows[:, 1:]])
     places = world_to_geodetic(T_world_pose[:, :3, 3])

@@ -17,9 +17,9 @@ from factor_graphs.stamps import far_off
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import frames, kitti_calibration
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, read_text, shown
-from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.files.pictures import read_picture
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, refused, shown
+from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
 from gnss_sem_map.sensor_log.cameras import Camera
 
 Array = NDArray[np.float64]
@@ -45,47 +45,34 @@ def read(sequence: Path, with_imu: bool = True) -> SensorLog:
     file = sequence / "calib.txt"
     camera = next((n for n in CAMERAS if is_folder(sequence / f"image_{n}")), CAMERAS[0])
     name = "Tr_velo_to_cam" if is_file(file) and "Tr_velo_to_cam:" in read_text(file) else "Tr"
-    rows = kitti_calibration.read_rows(file, {f"P{camera}": 12, name: 12})
-    Tr = rows[name].reshape(3, 4)
-    Tr = kitti_calibration.transform(Tr[:, :3], Tr[:, 3], f"{shown(file)}: Tr")
+    about = kitti_calibration.CalibrationFile(file, {f"P{camera}": 12, name: 12})
+    Tr = about.pose(name)
     times = _times(sequence / "times.txt")
     poses = _poses(_poses_file(sequence))
     if len(times) != len(poses):
-        raise DataError(
-            f"{shown(sequence)}: found {len(poses)} poses and {len(times)} times, expected as many;"
-            " are poses.txt and times.txt of the same sequence?"
+        raise refused(
+            sequence,
+            f"found {len(poses)} poses and {len(times)} times, expected as many; of one sequence?",
         )
-    scan_files = frames.numbered("scan", sequence / "velodyne", ".bin")
-    images = sequence / f"image_{camera}"
-    image_files = frames.numbered("image", images, *frames.IMAGE_SUFFIXES)
-    size = frames.first_size(image_files.files.values())
-    K, T_camera_camera0 = kitti_calibration.split_projection(rows[f"P{camera}"], f"{shown(file)}: P{camera}")
+    stamps, why = dict(enumerate(times.tolist())), "no pose for this frame"
+    scans = frames.numbered("scan", sequence / "velodyne", ".bin")
+    images = frames.numbered("image", sequence / f"image_{camera}", *frames.IMAGE_SUFFIXES)
+    size = frames.first_size(images.files.values())
+    K, T_camera_camera0 = about.projection(f"P{camera}")
     cameras = () if size is None else (Camera(T_camera_camera0 @ Tr, K, size),)
-    skips = [
-        *_left_out("scan", sequence / "velodyne", len(poses), scan_files),
-        *_left_out("image", images, len(poses), image_files),
-    ]
+    of_scans, lost_scans = scans.joined(stamps, why) if is_folder(scans.folder) else ([], scans.skips)
+    of_images, lost_images = images.joined(stamps, why) if is_folder(images.folder) else ([], images.skips)
     return SensorLog(
         name=f"sequence {shown(sequence.name)}",
         epoch_ns=0,
         calibration=Calibration(np.eye(4), cameras),
         scans=tuple(
-            Scan(
-                path.stem,
-                number,
-                float(times[number]),
-                partial(_read_compensated, path, frames.state_of(path)),
-            )
-            for number, path in scan_files.files.items()
-            if number < len(poses)
+            Scan(path.stem, n, stamp, partial(_read_compensated, path, frames.state_of(path)))
+            for n, path, stamp in of_scans
         ),
-        images=tuple(
-            Image(number, float(times[number]), partial(frames.read_image, path, size))
-            for number, path in image_files.files.items()
-            if number < len(poses)
-        ),
+        images=tuple(Image(n, stamp, partial(read_picture, path, size)) for n, path, stamp in of_images),
         given=Trajectory(times, _lidar_poses(poses, Tr)),
-        skips=tuple(skips),
+        skips=(*lost_scans, *lost_images),
     )
 
 
@@ -96,61 +83,51 @@ def _poses_file(sequence: Path) -> Path:
     own = sequence / "poses.txt"
     if is_file(own) or is_file(beside):
         return own if is_file(own) else beside
-    raise DataError(
-        f"{shown(own)}: missing, and so is {shown(beside)}; expected one line of 12 numbers per frame; of a sequence"
-        " without poses, map the raw drive that it is from"
+    raise refused(
+        own,
+        f"missing, and so is {shown(beside)}; expected 12 numbers a line; or map its raw drive",
     )
-
-
-def _left_out(what: str, folder: Path, poses: int, found: frames.Frames) -> list[Skip]:
-    """Frames with a pose and no file, files without a pose, and files of a frame that has another one."""
-    beyond = [path for number, path in found.files.items() if number >= poses]
-    return [
-        *(frames.missing(what, folder, range(poses), found.files) if is_folder(folder) else ()),
-        *(Skip(what, shown(path), "no pose for this frame") for path in beyond),
-        *found.skips,
-    ]
 
 
 def _times(path: Path) -> Array:
     """Stamps, s, that increase; raises DataError, with the line, for anything else."""
-    times = read_table(path, 1)[:, 0]
+    times = kitti_calibration.read_table(path, 1)[:, 0]
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
         line = int(backwards[0]) + 2
-        raise DataError(
-            f"{shown(path)}: line {line}: found {times[line - 1]:.9g} after {times[line - 2]:.9g}, expected times that"
-            " increase"
+        raise refused(
+            path,
+            f"line {line}: {times[line - 1]:.9g} after {times[line - 2]:.9g}, expected rising",
         )
     check_unit(times, LONGEST_FRAME_STEP_S, shown(path))
     off = np.flatnonzero(far_off(times))
     if len(off):
-        raise DataError(
-            f"{shown(path)}: line {off[0] + 1}: found {times[off[0]]:.9g} s, far off all others; expected the times of"
-            " consecutive frames"
+        raise refused(
+            path,
+            f"line {off[0] + 1}: found {times[off[0]]:.9g} s, far off all others",
         )
     return times
 
 
 def _poses(path: Path) -> Array:
     """Poses (k, 3, 4); raises DataError, with the line, for one that is no rigid transform."""
-    poses = read_table(path, 12).reshape(-1, 3, 4)
+    poses = kitti_calibration.read_table(path, 12).reshape(-1, 3, 4)
     R = poses[:, :, :3]
     with np.errstate(all="ignore"):
         off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
         wrong = ~(off <= SIX_DIGITS) | ~(np.linalg.det(R) > 0)
     if wrong.any():
         line = int(np.flatnonzero(wrong)[0])
-        raise DataError(
-            f"{shown(path)}: line {line + 1}: {kitti_calibration.rotation_fault(R[line])}, expected a rotation in a"
-            f" rigid pose; {wrong.sum()} of {len(poses)} poses have this fault"
+        raise refused(
+            path,
+            f"line {line + 1}: {kitti_calibration.rotation_fault(R[line])} in {wrong.sum()} of {len(poses)} poses",
         )
     far = ~(np.abs(poses[:, :, 3]) <= FARTHEST_M).all(axis=1)
     if far.any():
         line = int(np.flatnonzero(far)[0])
-        raise DataError(
-            f"{shown(path)}: line {line + 1}: found a position {np.abs(poses[line, :, 3]).max():.3g} m away, expected"
-            f" at most {FARTHEST_M:g} m"
+        raise refused(
+            path,
+            f"line {line + 1}: found a position {np.abs(poses[line, :, 3]).max():.3g} m away",
         )
     return poses
 
@@ -168,33 +145,3 @@ def _lidar_poses(poses: Array, Tr: Array) -> Array:
 def _read_compensated(path: Path, state: frames.State | None) -> Points:
     rows = frames.read_points(path, state=state)
     return Points(rows[:, :3], rows[:, 3], None)
-
-
-def read_table(path: Path, columns: int) -> Array:
-    """Rows (n, columns) of numbers, without comments; raises DataError, with the line, for anything else."""
-    if not is_file(path):
-        raise DataError(
-            f"{shown(path)}: missing; expected one line of {columns} numbers per frame"
-            + (
-                "; it comes with the calibration of the data set (data_odometry_calib.zip)"
-                if columns == 1
-                else ""
-            )
-        )
-    rows = []
-    for number, line in enumerate(read_lines(path), 1):
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != columns or not np.isfinite(row).all():
-            raise DataError(
-                f"{shown(path)}: line {number}: found {line[:40]!r}, expected {columns} finite numbers"
-            )
-        rows.append(row)
-    if not rows:
-        raise DataError(f"{shown(path)}: empty; expected one line of {columns} numbers per frame")
-    return np.array(rows)

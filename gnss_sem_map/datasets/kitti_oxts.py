@@ -20,10 +20,10 @@ from factor_graphs.stamps import far_off
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets import frames
-from gnss_sem_map.datasets.kitti_stamps import stamps_ns
+from gnss_sem_map.datasets.kitti_calibration import stamps_ns
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_folder, read_text, shown
-from gnss_sem_map.sensor_log import Skip
+from gnss_sem_map.files.untrusted import is_folder, read_text, refused, shown
+from gnss_sem_map.sensor_log import Skip, skipped
 
 Array = NDArray[np.float64]
 
@@ -79,11 +79,11 @@ def navigation(drive: Path, twins: tuple[Path, ...], with_imu: bool = True) -> N
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
     is_fix, invalid = valid_fixes(stamps, oxts[:, [LAT, LON, ALT]], oxts[:, [POSITION_ACCURACY]])
     if not is_fix.any():
-        raise DataError(
-            f"{shown(drive / 'oxts')}: not one of {len(oxts)} rows is a fix; found {next(iter(invalid))}; expected"
-            " degrees, metres of WGS 84 and an accuracy above 0 (columns 1 to 3, and 24)"
+        raise refused(
+            drive / "oxts",
+            f"not one of {len(oxts)} rows is a fix; found {next(iter(invalid))} (columns 1 to 3, 24)",
         )
-    fix_skips = [Skip("fix", shown(drive / "oxts"), f"{n} rows: {why}", n) for why, n in invalid.items()]
+    fix_skips = skipped("fix", drive / "oxts", "rows", invalid)
     epoch_ns = int(oxts_ns[0])
     if np.median(np.diff(stamps)) < 0.5 / MOST_FIXES_PER_S:
         is_fix &= np.diff(np.floor(stamps * MOST_FIXES_PER_S + 1e-3), prepend=-1.0) > 0
@@ -111,32 +111,27 @@ def oxts_rows(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     """Stamps and rows of the navigation unit, sorted, without repeated stamps; and the skipped rows."""
     found = frames.numbered("oxts", drive / "oxts" / "data", ".txt")
     stamps, skips = stamps_ns(drive / "oxts" / "timestamps.txt")
-    skips += found.skips + frames.missing("oxts", drive / "oxts", stamps, found.files)
+    of_files, lost = found.joined(stamps)
+    skips += lost
     rows: dict[int, Array] = {}
-    for number, path in found.files.items():
+    for _, path, stamp in of_files:
         fault, row = _oxts_row(path)
-        if number not in stamps:
-            fault = "no stamp for this frame"
-        elif not fault and stamps[number] in rows:
-            fault = "repeated stamp"
-        if fault:
+        if fault := fault or ("repeated stamp" if stamp in rows else ""):
             skips.append(Skip("oxts", shown(path), fault))
         else:
-            rows[stamps[number]] = row
+            rows[stamp] = row
     order = sorted(rows)
     off = far_off(np.array(order, np.float64) * 1e-9)
-    for stamp, is_off in zip(order, off, strict=True):
-        if is_off:
-            skips.append(
-                Skip(
-                    "oxts", shown(drive / "oxts"), f"stamp {np.datetime64(stamp, 'ns')} is far off all others"
-                )
-            )
-    order = [stamp for stamp, is_off in zip(order, off, strict=True) if not is_off]
+    for stamp in (stamp for stamp, is_off in zip(order, off, strict=True) if is_off):
+        del rows[stamp]
+        told = f"stamp {np.datetime64(stamp, 'ns')} is far off all others"
+        skips.append(Skip("oxts", shown(drive / "oxts"), told))
+    order = sorted(rows)
     if len(order) < 3:
-        raise DataError(
-            f"{shown(drive / 'oxts')}: found {len(order)} usable rows of {len(found.files)}, expected at least 3"
-            + (f"; first reason: {skips[0].where}: {skips[0].reason}" if skips else "")
+        raise refused(
+            drive / "oxts",
+            f"found {len(order)} usable rows of {len(found.files)}, expected at least 3"
+            + (f"; first reason: {skips[0].where}: {skips[0].reason}" if skips else ""),
         )
     return _measured(drive, np.array(order, np.int64), np.stack([rows[stamp] for stamp in order]), skips)
 

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets import frames, kitti_calibration
+from gnss_sem_map.datasets.kitti_calibration import CalibrationFile, stamps_ns
 from gnss_sem_map.datasets.kitti_oxts import OXTS_NOISE, navigation
-from gnss_sem_map.datasets.kitti_stamps import stamps_ns
 from gnss_sem_map.datasets.stamps import in_order, sweep_fault
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.pictures import read_picture
 from gnss_sem_map.files.untrusted import is_file, is_folder, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion
@@ -32,7 +33,7 @@ CAMERAS = ("02", "03", "00", "01")
 CAMERA_TIME_OFFSET_S = -0.0085
 
 FORMAT, SIGNS = "kitti-raw", "oxts/ (KITTI raw)"
-IMU_TO_LIDAR = "calib_imu_to_velo.txt"
+IMU_TO_LIDAR, R_AND_T = "calib_imu_to_velo.txt", {"R": 9, "T": 3}
 
 
 def is_drive(drive: Path) -> bool:
@@ -104,49 +105,34 @@ def _calibration(date: Path, drive: Path, camera: str) -> Calibration:
 
 def camera_from_lidar(date: Path, camera: str = "02", seen: tuple[int, int] | None = None) -> Camera:
     """A camera by the calibration of a date: rectified, unless images of a size `seen` are those of its sensor."""
-    of_lidar, of_cameras = date / "calib_velo_to_cam.txt", date / "calib_cam_to_cam.txt"
-    velo_to_cam = kitti_calibration.read_rows(of_lidar, {"R": 9, "T": 3})
-    T_camera0_lidar = kitti_calibration.transform(velo_to_cam["R"], velo_to_cam["T"], f"{shown(of_lidar)}: R")
-    rows = kitti_calibration.read_rows(
-        of_cameras, {"R_rect_00": 9, f"P_rect_{camera}": 12, f"S_rect_{camera}": 2}
-    )
-    size = kitti_calibration.image_size(rows[f"S_rect_{camera}"], f"{shown(of_cameras)}: S_rect_{camera}")
+    of_cameras, size_name, P = date / "calib_cam_to_cam.txt", f"S_rect_{camera}", f"P_rect_{camera}"
+    T_camera0_lidar = CalibrationFile(date / "calib_velo_to_cam.txt", R_AND_T).pose(*R_AND_T)
+    about = CalibrationFile(of_cameras, {"R_rect_00": 9, P: 12, size_name: 2})
+    size = about.size(size_name)
     if seen is not None and seen != size:
         raw = _sensor(of_cameras, camera, T_camera0_lidar)
         if raw.image_size == seen:
             return raw
-    K, T_camera_camera0 = kitti_calibration.split_projection(
-        rows[f"P_rect_{camera}"], f"{shown(of_cameras)}: P_rect_{camera}"
-    )
-    T_camera0_rectified = kitti_calibration.transform(
-        rows["R_rect_00"], np.zeros(3), f"{shown(of_cameras)}: R_rect_00"
-    )
-    T = kitti_calibration.exact(T_camera_camera0 @ T_camera0_rectified @ T_camera0_lidar)
+    K, T_camera_camera0 = about.projection(P)
+    T = kitti_calibration.exact(T_camera_camera0 @ about.pose("R_rect_00") @ T_camera0_lidar)
     return Camera(T, K, size, CAMERA_TIME_OFFSET_S)
 
 
 def _sensor(of_cameras: Path, camera: str, T_camera0_lidar: Array) -> Camera:
     """A camera whose images are not rectified."""
-    names = {f"{name}_{camera}": count for name, count in {"S": 2, "K": 9, "D": 5, "R": 9, "T": 3}.items()}
+    S, K, D, R, T = (f"{name}_{camera}" for name in "SKDRT")
     try:
-        S, K, D, R, T = kitti_calibration.read_rows(of_cameras, names).values()
+        about = CalibrationFile(of_cameras, {S: 2, K: 9, D: 5, R: 9, T: 3})
     except DataError as error:
-        raise DataError(
-            f"{error}; the images are not of the size S_rect_{camera}, as rectified ones are"
-        ) from None
-    T_camera_camera0 = kitti_calibration.transform(R, T, f"{shown(of_cameras)}: R_{camera}")
-    lens = Distortion(model="brown", coefficients=tuple(D.tolist()))
-    return Camera(
-        kitti_calibration.exact(T_camera_camera0 @ T_camera0_lidar), K.reshape(3, 3),
-        kitti_calibration.image_size(S, f"{shown(of_cameras)}: S_{camera}"), CAMERA_TIME_OFFSET_S, lens,
-    )  # fmt: skip
+        raise DataError(f"{error}; its images are not rectified, of the size S_rect_{camera}") from None
+    lens = Distortion(model="brown", coefficients=tuple(about.rows[D].tolist()))
+    T_camera_lidar = kitti_calibration.exact(about.pose(R, T) @ T_camera0_lidar)
+    return Camera(T_camera_lidar, about.rows[K].reshape(3, 3), about.size(S), CAMERA_TIME_OFFSET_S, lens)
 
 
 def lidar_from_imu(date: Path) -> Array:
     """T_lidar_imu (4, 4), as the calibration of a date has it."""
-    file = date / IMU_TO_LIDAR
-    rows = kitti_calibration.read_rows(file, {"R": 9, "T": 3})
-    return kitti_calibration.transform(rows["R"], rows["T"], f"{shown(file)}: R")
+    return CalibrationFile(date / IMU_TO_LIDAR, R_AND_T).pose(*R_AND_T)
 
 
 def _twins(drive: Path) -> tuple[Path, ...]:
@@ -159,24 +145,28 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     folder = drive / "velodyne_points"
     found = frames.numbered("scan", folder / "data", *frames.SCAN_SUFFIXES)
     if not found.files:
-        return (), found.skips + _all_missing("scan", folder)
+        return (), _all_missing(found)
     middle, skips = stamps_ns(folder / "timestamps.txt")
     start, in_start = _ends_of_sweeps(folder / "timestamps_start.txt", middle, -0.5)
     end, in_end = _ends_of_sweeps(folder / "timestamps_end.txt", middle, 0.5)
-    skips += in_start + in_end + found.skips + frames.missing("scan", folder, middle, found.files)
+    of_files, lost = found.joined(
+        {n: (t, start[n], end[n]) for n, t in middle.items() if n in start and n in end}
+    )
+    skips += in_start + in_end + lost
     scans = []
-    for number, path in found.files.items():
-        if number not in middle or number not in start or number not in end:
-            skips.append(Skip("scan", shown(path), "no stamp for this frame"))
-            continue
-        stamp, begun, ended = ((t[number] - epoch_ns) * 1e-9 for t in (middle, start, end))
-        fault = sweep_fault(stamp, begun, ended)
-        if fault is not None:
+    for number, path, moments in of_files:
+        stamp, *sweep = ((t - epoch_ns) * 1e-9 for t in moments)
+        if fault := sweep_fault(stamp, *sweep):
             skips.append(Skip("scan", shown(path), fault))
         else:
-            read = partial(read_sweep, path, stamp, begun, ended, frames.state_of(path))
-            scans.append(Scan(path.stem, number, stamp, read, (begun, ended)))
+            scans.append(scan_of(path, number, stamp, sweep[0], sweep[1]))
     return in_order("scan", scans, skips), skips
+
+
+def scan_of(path: Path, number: int, stamp: float, start: float, end: float) -> Scan:
+    """A scan that is read when it is needed, see `read_sweep`."""
+    read = partial(read_sweep, path, stamp, start, end, frames.state_of(path))
+    return Scan(path.stem, number, stamp, read, (start, end))
 
 
 def _ends_of_sweeps(path: Path, middle: dict[int, int], share: float) -> tuple[dict[int, int], list[Skip]]:
@@ -216,13 +206,12 @@ def _images(
 ) -> tuple[tuple[Image, ...], list[Skip]]:
     found = _image_files(folder)
     if not found.files:
-        return (), found.skips + _all_missing("image", folder)
-    return stamped_images(found, folder, epoch_ns, size, of_scans=of_scans or None)
+        return (), _all_missing(found)
+    return stamped_images(found, epoch_ns, size, of_scans=of_scans or None)
 
 
 def stamped_images(
     found: frames.Frames,
-    folder: Path,
     epoch_ns: int,
     size: tuple[int, int] | None,
     camera: str = "",
@@ -232,28 +221,23 @@ def stamped_images(
 
     Without stamps of their own, they have those `of_scans` of their numbers, which triggered them.
     """
-    file = folder / "timestamps.txt"
-    if of_scans is not None and found.files and not is_file(file):
-        count = len(found.files)
+    file, count = found.folder.parent / "timestamps.txt", len(found.files)
+    if of_scans is not None and count and not is_file(file):
+        stamps = {n: of_scans[n] for n in found.files if n in of_scans}
         told = f"missing: {count} images have the stamps of the scans of their numbers"
-        stamps, skips = (
-            {n: of_scans[n] for n in found.files if n in of_scans},
-            [Skip("stamps", shown(file), told, count)],
-        )
+        skips = [Skip("stamps", shown(file), told, count)]
     else:
         stamps, skips = stamps_ns(file)
-    skips += found.skips + frames.missing("image", folder, stamps, found.files)
-    images = []
-    for number, path in found.files.items():
-        if number in stamps:
-            stamp = (stamps[number] - epoch_ns) * 1e-9
-            images.append(Image(number, stamp, partial(frames.read_image, path, size), camera))
-        else:
-            skips.append(Skip("image", shown(path), "no stamp for this frame"))
+    of_files, lost = found.joined(stamps)
+    skips += lost
+    images = [
+        Image(n, (ns - epoch_ns) * 1e-9, partial(read_picture, path, size), camera)
+        for n, path, ns in of_files
+    ]
     return in_order("image", images, skips), skips
 
 
-def _all_missing(what: str, folder: Path) -> list[Skip]:
+def _all_missing(found: frames.Frames) -> list[Skip]:
     """The frames of a sensor that has no file at all, if it has stamps."""
-    path = folder / "timestamps.txt"
-    return frames.missing(what, folder, stamps_ns(path)[0], {}) if is_file(path) else []
+    path = found.folder.parent / "timestamps.txt"
+    return found.skips + (found.missing(stamps_ns(path)[0]) if is_file(path) else [])

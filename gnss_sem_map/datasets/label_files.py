@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import inside, is_folder, read_bytes, shown
+from gnss_sem_map.files.untrusted import inside, is_folder, read_bytes, refused
 
 MOST_LABEL_BYTES = 1 << 28
 
@@ -23,7 +22,7 @@ def read_confidence(path: Path) -> NDArray[np.float16]:
     """The probabilities of one file; raises DataError when it is cut short, or holds other values."""
     found = _values(path, "<f2")
     if not ((found >= 0) & (found <= 1)).all():
-        raise DataError(f"{shown(path)}: found values outside 0..1, expected probabilities")
+        raise refused(path, "found values outside 0..1, expected probabilities")
     return found
 
 
@@ -35,9 +34,7 @@ def read_looks(path: Path) -> NDArray[np.uint8]:
 def _values(path: Path, dtype: str) -> NDArray[Any]:
     content, size = read_bytes(path, MOST_LABEL_BYTES), np.dtype(dtype).itemsize
     if len(content) % size:
-        raise DataError(
-            f"{shown(path)}: truncated label file; found {len(content)} bytes, expected a multiple of {size}"
-        )
+        raise refused(path, f"truncated labels; found {len(content)} bytes, expected a multiple of {size}")
     return np.frombuffer(content, dtype)
 
 
@@ -54,7 +51,7 @@ def label_files(folder: Path) -> dict[str, Path]:
         if path.suffix == ".label"
     }
     if not files:
-        raise DataError(f"{shown(folder)}: no .label files; expected one per scan")
+        raise refused(folder, "no .label files; expected one per scan")
     return files
 
 

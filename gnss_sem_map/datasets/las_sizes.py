@@ -10,8 +10,7 @@ import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.files.untrusted import refused
 
 if TYPE_CHECKING:
     from laspy import LasHeader
@@ -57,7 +56,7 @@ def check_chunks(file: BinaryIO, header: LasHeader, path: Path) -> None:
         return
     [about] = header.vlrs.get("LasZipVlr")[:1] or [None]
     if about is None:
-        raise DataError(f"{shown(path)}: is compressed and has no LASzip record; is it damaged?")
+        raise refused(path, "is compressed and has no LASzip record; is it damaged?")
     vlr, record, before = lazrs.LazVlr(about.record_data), header.point_format.size, file.tell()
     layers = LAYERS + MORE_LAYERS.get(header.point_format.id, 0) + header.point_format.num_extra_bytes
     file.seek(header.offset_to_point_data)
@@ -87,6 +86,4 @@ def _chunks(file: BinaryIO, points_at: int, size: int) -> int:
 
 def _refuse(what: str, least: int, most: int, path: Path) -> None:
     if least > most:
-        raise DataError(
-            f"{shown(path)}: its {what} need {least} bytes, and there are {most}; is it truncated?"
-        )
+        raise refused(path, f"its {what} need {least} bytes, and there are {most}; is it truncated?")

@@ -19,7 +19,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.datasets.las_sizes import check_chunks, checked
 from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.geoid import undulation
-from gnss_sem_map.files.untrusted import open_file, shown
+from gnss_sem_map.files.untrusted import open_file, refused
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.downsampling import one_per_cube
 from gnss_sem_map.scans.local_maps import CUBE_M
@@ -68,18 +68,19 @@ def read_base(path: Path, frame: LocalFrame, geoid: Path | None = None) -> BaseC
         laspy.errors.LaspyException, lazrs.LazrsError, ProjError, OSError, ValueError, IndexError, struct.error,
     ) as error:  # fmt: skip
         reason = one_line(error)
-        raise DataError(
-            f"{shown(path)}: cannot be read as LAS or LAZ ({reason}); is it damaged? other formats: pdal translate IN"
-            " OUT.laz"
+        raise refused(
+            path,
+            f"cannot be read as LAS or LAZ ({reason}); pdal translate IN OUT.laz",
         ) from None
     points = np.concatenate(parts)
     if not given:
-        raise DataError(f"{shown(path)}: holds no points, or all are withheld; expected a cloud of the place")
+        raise refused(path, "holds no points, or all are withheld; expected a cloud of the place")
     if not len(points):
-        raise DataError(
-            f"{shown(path)}: found no point within {MOST_M / 1000:g} km of the origin {frame.lat_deg:.4f},"
+        raise refused(
+            path,
+            f"found no point within {MOST_M / 1000:g} km of the origin {frame.lat_deg:.4f},"
             f" {frame.lon_deg:.4f}; expected a cloud of the same place: is its coordinate system the one it is in, with"
-            " eastings before northings?"
+            " eastings before northings?",
         )
     return BaseCloud(path.name, one_per_cube(points, CUBE_M))
 
@@ -100,9 +101,10 @@ class _Placing:
         """Raises DataError for a file without a coordinate system, or heights above a geoid that PROJ has not."""
         crs, unit_m = _crs_of(header), None
         if crs is None:
-            raise DataError(
-                f"{shown(path)}: has no coordinate system; expected a georeferenced LAS or LAZ; write it into the file"
-                " (pdal translate IN.laz OUT.laz --writers.las.a_srs=EPSG:25832, or the code of yours)"
+            raise refused(
+                path,
+                "has no coordinate system; expected one, such as"
+                " EPSG:25832: pdal translate IN.laz OUT.laz --writers.las.a_srs=EPSG:25832",
             )
         for key in _geo_keys(header):
             unit_m = UNIT_M.get(key.value_offset, unit_m) if key.id == VERTICAL_UNIT else unit_m
@@ -119,9 +121,10 @@ class _Placing:
         if found is not None:
             return cls(frame, found, unit_m / axis_m, None)
         if geoid is None:
-            raise DataError(
-                f"{shown(path)}: its heights are those of {vertical.name}, and PROJ has no grid for them; give the"
-                " grid of its geoid with --geoid, or heights above the ellipsoid"
+            raise refused(
+                path,
+                f"its heights are those of {vertical.name}, without a grid; give --geoid, or heights above the"
+                " ellipsoid",
             )
         return cls(frame, flat, unit_m, geoid)
 

@@ -13,9 +13,8 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.settings import SampleInstant
 from gnss_sem_map.datasets.gnss_files import GnssFile
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import fault_of, read_yaml
-from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.files.untrusted import is_file, refused
 from gnss_sem_map.sensor_log import Calibration
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, SensorName, lidar_to_camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
@@ -156,9 +155,7 @@ def read_log_yaml(path: Path) -> LogFile:
     try:
         return LogFile.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        raise DataError(
-            f"{shown(path)}: {fault_of(error)}; known keys are {sorted(LogFile.model_fields)}"
-        ) from None
+        raise refused(path, f"{fault_of(error)}; known keys are {sorted(LogFile.model_fields)}") from None
 
 
 def calibration_of(about: LogFile, path: Path) -> Calibration:
@@ -174,9 +171,7 @@ def _only_camera(about: LogFile, path: Path) -> dict[str, CameraFile]:
     if about.T_camera_lidar is None and about.K is None and about.image_size is None:
         return {}
     if about.T_camera_lidar is None or about.K is None or about.image_size is None:
-        raise DataError(
-            f"{path}: a camera needs all of T_camera_lidar, K and image_size; found only some of them"
-        )
+        raise refused(path, "a camera needs all of T_camera_lidar, K and image_size; found only some of them")
     only = CameraFile(
         K=about.K, image_size=about.image_size, T_camera_lidar=about.T_camera_lidar,
         distortion=about.distortion, time_offset_s=about.camera_time_offset_s,

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +18,12 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import ImuSamples
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
-from gnss_sem_map.datasets.receiver import Receiver, measured
+from gnss_sem_map.datasets.gnss_files.positions import Receiver, measured
 from gnss_sem_map.datasets.ros import clouds, pictures, receiver_topics, roles
 from gnss_sem_map.datasets.ros.bag import METADATA, SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
-from gnss_sem_map.datasets.ros.decoding import header_ns
-from gnss_sem_map.datasets.ros.fix_topics import fix_rows
 from gnss_sem_map.datasets.ros.imu_topics import samples_of
+from gnss_sem_map.datasets.ros.receiver_topics import fix_rows
 from gnss_sem_map.datasets.ros.rig import (
     GnssTopic,
     ImuTopic,
@@ -34,11 +32,11 @@ from gnss_sem_map.datasets.ros.rig import (
     read_rig,
     rig_file,
 )
-from gnss_sem_map.datasets.ros.stamps import Clock, stamps_of
+from gnss_sem_map.datasets.ros.stamps import Clock, header_ns, stamps_of
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import shown
-from gnss_sem_map.sensor_log import Image, Lidar, Points, Scan, SensorLog, Skip
+from gnss_sem_map.files.untrusted import refused, shown
+from gnss_sem_map.sensor_log import Image, Lidar, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -105,9 +103,7 @@ def _receiver(bag: Bag, rig: Rig, place: Path, p_imu_antenna: Array) -> tuple[in
     where, second = shown(bag.path), rig.gnss.p_imu_antenna2
     valid, invalid = valid_fixes(fixes[:, 0], fixes[:, 1:4], fixes[:, 4:7])
     if not valid.any():
-        raise DataError(
-            f"{where}: not one of {len(fixes)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
-        )
+        raise refused(where, f"not one of {len(fixes)} fixes is usable ({next(iter(invalid), 'none')})")
     skips += [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
     rows = of_velocity = of_heading = fixes[valid]
     if rig.gnss.velocity is not None:
@@ -182,15 +178,9 @@ def _scans(bag: Bag, about: LidarTopic, epoch_ns: int) -> tuple[tuple[Scan, ...]
     scans = []
     for k in np.flatnonzero(believed).tolist():
         ns, stamp = int(said[k]), (int(said[k]) - epoch_ns) * 1e-9
-        read_it = partial(
-            _read_scan, bag.file_of(messages, k), bag, messages, k, stamp, ns, times, about.intensity_max
-        )
-        scans.append(Scan(f"{k:010d}", k, stamp, read_it))
+        of_cloud = bag.file_of(messages, k), bag, messages, k, stamp, ns, times, about.intensity_max
+        scans.append(Scan(f"{k:010d}", k, stamp, partial(clouds.read_cloud, *of_cloud)))
     return in_order("scan", scans, skips), skips
-
-
-def _read_scan(_file: Path, *of_cloud: Any) -> Points:
-    return clouds.read_cloud(*of_cloud)
 
 
 def _images(
@@ -202,21 +192,12 @@ def _images(
     for about, camera in zip(rig.cameras.values(), cameras, strict=False):
         messages = bag.messages(about.topic)
         said, believed, lost = stamps_of(bag, messages, about.stamps)
-        of_camera = [
-            Image(
-                k,
-                (int(said[k]) - epoch_ns) * 1e-9,
-                partial(_read_image, bag.file_of(messages, k), bag, messages, k, camera.image_size),
-                camera.name,
+        of_camera = []
+        for k in np.flatnonzero(believed).tolist():
+            read_it = partial(
+                pictures.read_image, bag.file_of(messages, k), bag, messages, k, camera.image_size
             )
-            for k in np.flatnonzero(believed).tolist()
-        ]
+            of_camera.append(Image(k, (int(said[k]) - epoch_ns) * 1e-9, read_it, camera.name))
         images += in_order("image", of_camera, lost)
         skips += lost
     return tuple(sorted(images, key=lambda image: image.stamp)), skips
-
-
-def _read_image(
-    _file: Path, bag: Bag, messages: Messages, k: int, size: tuple[int, int]
-) -> NDArray[np.uint8]:
-    return pictures.read_image(bag, messages, k, size)

@@ -29,6 +29,11 @@ def shown(path: object) -> str:
     return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
+def refused(where: object, why: str) -> DataError:
+    """The error of a file, or of what it holds: where, then what was found and expected, and what to do."""
+    return DataError(f"{shown(where)}: {why}")
+
+
 def status(path: Path, error: type[SemMapError] = DataError) -> os.stat_result | None:
     """Status of a path, with links resolved; None if nothing exists there. Raises `error` if it cannot be read."""
     try:
@@ -55,6 +60,12 @@ def is_file(path: Path, error: type[SemMapError] = DataError) -> bool:
     if found is not None:
         _check_ordinary(path, found, error)
     return found is not None
+
+
+def expect_file(path: Path, expected: str) -> None:
+    """Raise DataError, with what is expected there, unless the path is a file."""
+    if not is_file(path):
+        raise refused(path, f"missing; expected {expected}")
 
 
 def is_folder(path: Path, error: type[SemMapError] = DataError) -> bool:

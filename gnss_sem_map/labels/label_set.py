@@ -71,28 +71,26 @@ class LabelSet:
         count = len(self.names)
         if not 2 <= count <= 64 or len(set(self.names)) != count or OTHER in self.names:
             raise ConfigError(
-                f"class set {self.name!r}: found classes {list(self.names)},"
-                " expected 2 to 64 different names, none of them 'other'"
+                f"class set {self.name!r}: {list(self.names)}, expected 2 to 64 different names, no 'other'"
             )
         ids = self.semantic_kitti_ids.tolist()
         if {0, OTHER_SEMANTIC_KITTI_ID} & set(ids) or len(set(ids)) != count:
             raise ConfigError(
-                f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one for every class,"
-                f" none of them 0, which is a point without a class, or {OTHER_SEMANTIC_KITTI_ID}, which is `other`"
+                f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one each, no 0, nor"
+                f" {OTHER_SEMANTIC_KITTI_ID}, which is `other`"
             )
         if len(self.roles) != count:
             raise ConfigError(f"class set {self.name!r}: found {len(self.roles)} roles for {count} classes")
         for role in OF_ONE_CLASS:
             if len(those := [self.names[i] for i in self.having(role)]) > 1:
                 raise ConfigError(
-                    f"class set {self.name!r}: found the role {role} at {those}, expected it at one class at most"
+                    f"class set {self.name!r}: the role {role} at {those}, expected one at most"
                 )
         for source, table in self.sources.items():
             unknown = sorted(set(table.values()) - set(self.names))
             if unknown:
                 raise ConfigError(
-                    f"class set {self.name!r}: the table of {source!r} maps to {unknown},"
-                    f" expected one of {list(self.names)}"
+                    f"class set {self.name!r}: {source!r} maps to {unknown}, not to {list(self.names)}"
                 )
 
     @cached_property
@@ -134,9 +132,7 @@ class LabelSet:
     def index(self, name: str) -> int:
         """Index of a class; raises ConfigError with the most similar name for an unknown one."""
         if name not in self.names:
-            raise ConfigError(
-                f"class set {self.name!r} has no class {name!r}{_did_you_mean(name, self.names)}"
-            )
+            raise ConfigError(f"class set {self.name!r}: no class {name!r}{_did_you_mean(name, self.names)}")
         return self.names.index(name)
 
     def about(self) -> dict[str, Any]:
@@ -179,8 +175,7 @@ class LabelSet:
         """Index of the class for a name of a taxonomy, c for `other`; raises ConfigError without a table of it."""
         if source not in self.sources:
             raise ConfigError(
-                f"class set {self.name!r} does not know the classes of {source!r}, only of {list(self.sources)};"
-                f" add a table {source!r} to the `sources` of the class set file"
+                f"class set {self.name!r} knows no {source!r}, only {list(self.sources)}; add it to `sources`"
             )
         target = self.sources[source].get(name, OTHER)
         return len(self.names) if target == OTHER else self.names.index(target)
@@ -213,9 +208,7 @@ class LabelSet:
                 if len(targets) == 1:
                     return next(iter(targets))
                 ours = [(*self.names, OTHER)[target] for target in sorted(targets)]
-                raise ConfigError(
-                    f"class {name!r} is ambiguous in the class set {self.name!r}: {ours}; name it as one of these"
-                )
+                raise ConfigError(f"class {name!r} is any of {ours} in class set {self.name!r}; name it so")
         return None
 
 
@@ -285,8 +278,7 @@ def _given_roles(name: str, classes: Sequence[Mapping[str, Any]]) -> tuple[Role 
     said = [c.get("role") for c in classes]
     if unknown := [role for role in said if role not in (None, *Role)]:
         raise ConfigError(
-            f"class set {str(name)[:LONGEST_WORD]!r}: found the role {str(unknown[0])[:LONGEST_WORD]!r}, expected one"
-            f" of {[str(role) for role in Role]}, or null"
+            f"{str(name)[:99]!r}: found the role {str(unknown[0])[:99]!r}, expected one of {[*Role]}"
         )
     given = any("role" in c for c in classes)
     return tuple(None if role is None else Role(role) for role in said) if given else None

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.sensor_log import Image
 
 
@@ -59,20 +59,18 @@ def shrink_of(shape: tuple[int, ...], image_size: tuple[int, int], where: str) -
     for shrink in range(1, LARGEST_SHRINK + 1):
         if shape[:2] == (height // shrink, width // shrink):
             return shrink
-    raise DataError(
-        f"{where}: found {shape[1]} x {shape[0]} pixels for an image of {width} x {height}; expected that, or it"
-        f" divided by 2 to {LARGEST_SHRINK} and rounded down"
+    raise refused(
+        where,
+        f"found {shape[1]} x {shape[0]} pixels for an image of {width} x {height}; or that by 2 to {LARGEST_SHRINK}",
     )
 
 
 def check_shape(shape: tuple[int, ...], dtype: np.dtype[Any], count: int, where: str) -> None:
     """Raise DataError unless this is the shape and type of the probabilities of `count` classes."""
     if len(shape) != 3 or shape[2] != count or 0 in shape:
-        raise DataError(f"{where}: found probabilities {shape}, expected (h, w, {count})")
+        raise refused(where, f"found probabilities {shape}, expected (h, w, {count})")
     if dtype != np.uint8 and dtype.kind != "f":
-        raise DataError(
-            f"{where}: found probabilities of {dtype}, expected uint8 round(255 p) or floating 0..1"
-        )
+        raise refused(where, f"found probabilities of {dtype}, expected uint8 round(255 p) or floating 0..1")
 
 
 def checked_probabilities(
@@ -87,13 +85,11 @@ def checked_probabilities(
         with np.errstate(over="ignore"):
             probabilities = probabilities.astype(np.float32)
         if not (np.isfinite(probabilities).all() and (probabilities >= 0).all()):
-            raise DataError(f"{where}: found probabilities that are negative or not finite, expected 0..1")
+            raise refused(where, "found probabilities that are negative or not finite, expected 0..1")
     # Every 64th pixel is enough to tell probabilities from logits, percentages and 0/1 masks.
     largest = float(probabilities[::8, ::8].sum(2, dtype=np.float64).max(initial=0.0))
     if largest > one + slack or 0 < largest < one / 2:
-        raise DataError(
-            f"{where}: probabilities of a pixel sum to {largest:.4g}, expected {one:g}; normalise them"
-        )
+        raise refused(where, f"probabilities sum to {largest:.4g}, expected {one:g}; normalise them")
     return probabilities
 
 

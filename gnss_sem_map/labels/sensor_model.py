@@ -17,9 +17,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError, one_line
+from gnss_sem_map.errors import ConfigError, one_line
 from gnss_sem_map.files.structured import read_yaml
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.files.untrusted import refused, shown
 from gnss_sem_map.labels.label_set import LabelSet
 
 HEIGHT_EDGES_M = (-0.3, -0.15, -0.05, 0.05, 0.15, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 3.0, 4.0, 6.0)
@@ -56,8 +56,7 @@ class LabelCalibration:
         c = len(self.names)
         if not self.drives or not np.isfinite(self.temperature) or self.temperature <= 0:
             raise ConfigError(
-                f"label calibration: found {len(self.drives)} drives and temperature {self.temperature},"
-                " expected at least one drive and a temperature above 0"
+                f"label calibration: found {len(self.drives)} drives, temperature {self.temperature}; expected above 0"
             )
         for drive in self.drives:
             for what, counts, shape in (
@@ -137,9 +136,7 @@ def read(file: Path, label_set: LabelSet) -> LabelCalibration:
         )
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         reason = one_line(error, 300)
-        raise ConfigError(
-            f"{shown(file)}: {type(error).__name__} {reason}; expected a file of `gnss-sem-map calibrate`"
-        ) from None
+        raise ConfigError(f"{shown(file)}: {reason}; expected a file of `gnss-sem-map calibrate`") from None
     if found.names != label_set.names:
         raise ConfigError(
             f"{shown(file)}: is of the class set {found.class_set!r} with {list(found.names)}, the map's is"
@@ -166,7 +163,7 @@ def check_replaceable(file: Path) -> None:
         reason = "is no label calibration"
     except OSError as error:
         reason = f"cannot be read ({error.strerror})"
-    raise DataError(f"{file}: is there already, and {reason}; choose another -o")
+    raise refused(file, f"is there already, and {reason}; choose another -o")
 
 
 def opened(file: Path | None, label_set: LabelSet) -> LabelCalibration | None:

@@ -51,6 +51,16 @@ SCHEMES = {
 }
 """Syntax of the SPEC of a segmenter, by the word before the colon."""
 
+OF_NETWORKS = ("classes", "scale", "shrink")
+OPTIONS = {
+    "labels": ("ids", "taxonomy"), "refinenet": OF_NETWORKS, "hf": OF_NETWORKS,
+    "onnx": ("classes", "mean", "std", "order", "pixel_max", "scale", "shrink"), "python": ("classes",),
+    "demo": ("shrink",),
+}  # fmt: skip
+"""What a SPEC may say behind its question mark."""
+EXTRAS = {"refinenet": "segmentation", "demo": "segmentation", "hf": "hf", "onnx": "onnx"}
+"""What must be installed for it."""
+
 LONGEST_SPEC = 1000
 
 DEMO_NETWORK = Path(__file__).parent / "demo_network" / "network.safetensors"
@@ -100,45 +110,35 @@ def open_segmenter(
         case "labels":
             from gnss_sem_map.segmentation.cached import CachedLabels
 
-            _only(options, spec, "ids", "taxonomy")
             return CachedLabels(Path(place), label_set, sizes, **options)
-        case "refinenet":
-            _only(options, spec, "classes", "scale", "shrink")
-            with _needs("segmentation", spec):
+        case "refinenet" | "demo":
+            with _needs(scheme, spec):
                 from gnss_sem_map.segmentation.checkpoints import open_refinenet
-            return open_refinenet(Path(place), label_set, device, **options)
+            file = Path(place) if scheme == "refinenet" else DEMO_NETWORK
+            return open_refinenet(file, label_set, device, **options)
         case "hf":
-            _only(options, spec, "classes", "scale", "shrink")
-            with _needs("hf", spec):
+            with _needs(scheme, spec):
                 from gnss_sem_map.segmentation.huggingface import open_huggingface
             return open_huggingface(place, label_set, device, **options)
         case "onnx":
-            _only(options, spec, "classes", "mean", "std", "order", "pixel_max", "scale", "shrink")
-            with _needs("onnx", spec):
+            with _needs(scheme, spec):
                 from gnss_sem_map.segmentation.onnx_file import OnnxSegmenter
             return OnnxSegmenter(Path(place), label_set, device, **options)
         case "python":
             from gnss_sem_map.segmentation.python_callable import PythonSegmenter
 
-            _only(options, spec, "classes")
             return PythonSegmenter(place, label_set, **options)
-        case "demo":
-            _only(options, spec, "shrink")
-            with _needs("segmentation", spec):
-                from gnss_sem_map.segmentation.checkpoints import open_refinenet
-            return open_refinenet(DEMO_NETWORK, label_set, device, **options)
     close = difflib.get_close_matches(scheme, SCHEMES, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""
     raise ConfigError(
-        f"segmenter {spec!r}: unknown kind {scheme!r}; {hint}expected one of {list(SCHEMES.values())}; `run` also"
-        " takes none, for the geometry alone"
+        f"segmenter {spec!r}: unknown kind {scheme!r}; {hint}expected none, or one of {list(SCHEMES.values())}"
     )
 
 
 def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
     if len(spec) > LONGEST_SPEC:
         raise ConfigError(
-            f"segmenter {spec[:100]!r}: found {len(spec)} characters, expected at most {LONGEST_SPEC}"
+            f"segmenter {spec[:100]!r}: {len(spec)} characters, at most {LONGEST_SPEC} are read"
         )
     scheme, colon, rest = spec.partition(":")
     place, mark, query = rest.partition("?")
@@ -146,23 +146,17 @@ def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
     if scheme in SCHEMES and scheme != "demo" and (not colon or not place):
         raise ConfigError(f"segmenter {spec!r}: found nothing after {scheme!r}; expected {SCHEMES[scheme]}")
     if mark and not options:
-        raise ConfigError(
-            f"segmenter {spec!r}: found no options after '?', expected name=value joined by '&'"
-        )
+        raise ConfigError(f"segmenter {spec!r}: found no options after '?', expected a=b&c=d")
+    allowed = OPTIONS.get(scheme, tuple(options))
+    if unknown := sorted(set(options) - set(allowed)):
+        raise ConfigError(f"segmenter {spec!r}: unknown options {unknown}; expected some of {list(allowed)}")
     return scheme, place, options
 
 
 @contextmanager
-def _needs(extra: str, spec: str) -> Iterator[None]:
+def _needs(scheme: str, spec: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"segmenter {spec!r}: {error.name} is not installed; {how_to_install(extra)}"
-        ) from None
-
-
-def _only(options: dict[str, str], spec: str, *allowed: str) -> None:
-    unknown = sorted(set(options) - set(allowed))
-    if unknown:
-        raise ConfigError(f"segmenter {spec!r}: unknown options {unknown}; expected some of {list(allowed)}")
+        way = how_to_install(EXTRAS[scheme])
+        raise ConfigError(f"segmenter {spec!r}: {error.name} is not installed; {way}") from None

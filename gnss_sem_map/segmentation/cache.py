@@ -181,9 +181,7 @@ def _claim(folder: Path, about: dict[str, object], cameras: Sequence[str]) -> No
         if not file.exists():
             strange = sorted(path.name for path in folder.iterdir() if not PARTIAL.fullmatch(path.name))
             if strange:
-                raise ConfigError(
-                    f"cache {folder}: found {strange[0]} but no {ABOUT}; choose an empty folder"
-                )
+                raise ConfigError(f"cache {folder}: found {strange[0]}, no {ABOUT}; choose an empty folder")
             write_whole(file, (json.dumps(about) + "\n").encode())
         for inside in (folder / camera for camera in {"", *cameras}):
             inside.mkdir(exist_ok=True)
@@ -194,9 +192,7 @@ def _claim(folder: Path, about: dict[str, object], cameras: Sequence[str]) -> No
         raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
     found = read_json(file)
     if found != about:
-        raise ConfigError(
-            f"cache {folder}: was started with {found}, now called with {about}; choose another folder"
-        )
+        raise ConfigError(f"cache {folder}: was started with {found}, now {about}; choose another folder")
 
 
 def _file(folder: Path, image: Image) -> Path:
@@ -212,5 +208,5 @@ def write_probabilities(path: Path, probabilities: NDArray[np.uint8], class_name
         return path.stat().st_size
     except OSError as error:
         raise WriteError(
-            f"{path}: cannot be written ({error.strerror}); free some space and run again; `run` with --resume"
+            f"{path}: cannot be written ({error.strerror}); free some space, run again"
         ) from None

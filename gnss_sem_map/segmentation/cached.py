@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.archives import open_archive
-from gnss_sem_map.files.untrusted import inside, is_folder, shown
+from gnss_sem_map.files.untrusted import inside, is_folder, refused, shown
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.labels.probabilities import (
     LabelImage,
@@ -66,9 +66,7 @@ class CachedLabels:
             self._evidence = np.zeros((256, count), np.uint8)  # void has none
             self._evidence[:count] = np.rint(255 * of_hard_labels(count))
         elif ids is not None:
-            raise ConfigError(
-                f"labels {folder}: found .npz probabilities, where ids={ids} means nothing; leave it out"
-            )
+            raise ConfigError(f"labels {folder}: found .npz probabilities, which have no ids; leave out ids=")
         else:
             self.class_names = ()
         self._try(label_set)
@@ -90,8 +88,7 @@ class CachedLabels:
         if path is None:
             numbers = [number for _, number in self._files]
             raise MissingLabels(
-                f"{self._folder}: no labels of frame {image.frame}; {len(self._files)} frames have some, from"
-                f" {min(numbers)} to {max(numbers)}"
+                f"{self._folder}: no labels of frame {image.frame}; {len(numbers)}: {min(numbers)} to {max(numbers)}"
             )
         return self._read(path, self._sizes.get(image.camera))
 
@@ -125,9 +122,7 @@ class CachedLabels:
             return LabelImage(self._read_codes(self._meaning, path, size), self._evidence)
         probabilities, names = read_probabilities(path, size)
         if names != self.class_names:
-            raise DataError(
-                f"{path}: found classes {list(names)}, expected {list(self.class_names)} as in the first file"
-            )
+            raise refused(path, f"found classes {list(names)}, the first file has {list(self.class_names)}")
         return probabilities
 
     def _read_codes(self, meaning: Meaning, path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
@@ -144,9 +139,7 @@ def read_probabilities(
     with open_archive(path) as archive:
         stored, named = archive.array("probabilities"), archive.array("class_names", MOST_NAME_BYTES)
         if len(named.shape) != 1 or named.dtype.kind not in "US":
-            raise DataError(
-                f"{shown(path)}: found class_names of {named.dtype} {named.shape}, expected a list of names"
-            )
+            raise refused(path, f"found class_names of {named.dtype} {named.shape}, expected a list of names")
         axes = _axes(stored.shape, named.shape[0])
         shape = tuple(stored.shape[axis] for axis in axes)
         check_shape(shape, stored.dtype, named.shape[0], shown(path))
@@ -155,7 +148,7 @@ def read_probabilities(
         try:
             names = tuple(map(str, named.read().astype(np.str_)))
         except ValueError:
-            raise DataError(f"{shown(path)}: class_names are no text") from None
+            raise refused(path, "class_names are no text") from None
         values = stored.read()
         values = values.reshape(values.shape[-3:]).transpose([axis - values.ndim + 3 for axis in axes])
         return checked_probabilities(np.ascontiguousarray(values), len(names), shown(path)), names
@@ -187,9 +180,7 @@ def _label_files(
             files |= {(camera, number): path for number, path in numbered.items()}
             told = told or kind
     if all(found.values()):
-        raise DataError(
-            f"labels {shown(folder)}: found both .npz and .png; expected one kind, keep them in two folders"
-        )
+        raise DataError(f"labels {shown(folder)}: found .npz and .png; keep them in two folders")
     for suffix, files in found.items():
         if files:
             return files, suffix, told

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.atomic import write_whole
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.process.thread_pools import unless_left
 from gnss_sem_map.scans.projection import class_image
@@ -69,7 +70,7 @@ def probabilities_folder(work: Path, fingerprint: str, resume: bool, cameras: It
             (folder / camera).mkdir(exist_ok=True)
         write_whole(folder / ABOUT, json.dumps({"fingerprint": fingerprint}).encode())
     except OSError as error:
-        raise DataError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
+        raise refused(folder, f"cannot be written ({error.strerror}); choose another place") from None
     return folder
 
 

@@ -85,8 +85,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except LOAD_ERRORS as error:
         raise DataError(
-            f"checkpoint {path}: damaged, or holds code ({type(error).__name__}); expected only tensors: save the"
-            " state_dict alone, best as safetensors"
+            f"checkpoint {path}: damaged, or holds code ({type(error).__name__}); save the state_dict alone"
         ) from None
     return Checkpoint(path, _only_tensors(content, path))
 
@@ -100,9 +99,7 @@ def network_like(checkpoint: Checkpoint) -> nn.Module:
                        for i in (1, 2, 3, 4))  # fmt: skip
         backbone = next((name for name, known in RESNET_BLOCKS.items() if known == blocks), None)
         if backbone is None:
-            raise DataError(
-                f"checkpoint {checkpoint.path}: found {blocks} ResNet blocks, expected {RESNET_BLOCKS}"
-            )
+            raise DataError(f"checkpoint {checkpoint.path}: found blocks {blocks}, expected {RESNET_BLOCKS}")
         light_weight = shapes["p_ims1d2_outl1_dimred.weight"][-1] == 1
         return (LightWeightRefineNet if light_weight else RefineNet)(count, backbone)
     if "layer1.0.weight" in shapes and "conv8.weight" in shapes:
@@ -137,14 +134,11 @@ def load_strictly(network: nn.Module, checkpoint: Checkpoint) -> None:
     for what, names in (("missing", missing), ("unknown", extra), ("of another shape", other)):
         if names:
             raise DataError(
-                f"checkpoint {checkpoint.path}: {len(names)} of {len(expected)} tensors {what}, such as {names[:3]};"
-                " expected those of this RefineNet and no others"
+                f"checkpoint {checkpoint.path}: {len(names)} of {len(expected)} tensors {what}, {names[:3]}"
             )
     damaged = [name for name, tensor in found.items() if not torch.isfinite(tensor).all()]
     if damaged:
-        raise DataError(
-            f"checkpoint {checkpoint.path}: values that are not finite in {damaged[:3]}; get the file again"
-        )
+        raise DataError(f"checkpoint {checkpoint.path}: {damaged[:3]} are not finite; get it again")
     network.load_state_dict(found, strict=False)
 
 
@@ -187,9 +181,7 @@ def _only_tensors(content: Any, path: Path) -> dict[str, Tensor]:
         or not content
         or not all(isinstance(t, Tensor) for t in content.values())
     ):
-        raise DataError(
-            f"checkpoint {path}: found {type(content).__name__}, expected a state_dict of named tensors"
-        )
+        raise DataError(f"checkpoint {path}: found {type(content).__name__}, expected a state_dict")
     return {str(name).removeprefix("module."): tensor for name, tensor in content.items()}
 
 

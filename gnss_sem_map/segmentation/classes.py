@@ -36,9 +36,7 @@ def named_classes(
     if description is not None:
         names = tuple(name for item in description.split(",") for name in _expand(item.strip(), label_set))
         for name in label_set.unknown([name for name in names if name != VOID]):
-            raise ConfigError(
-                f"{label_set.not_known(name)}; name it `other` or add it to the `sources` of the class set file"
-            )
+            raise ConfigError(f"{label_set.not_known(name)}; name it `other`, or add it to `sources`")
     elif own is not None and not all(NUMBERED.fullmatch(name.strip()) for name in own):
         names = tuple(own)
         check_some_known(names, label_set, where)
@@ -50,9 +48,7 @@ def named_classes(
         advice = "cityscapes" if count is None else usual or "road,sidewalk,..."
         raise ConfigError(f"{where}: found {found} without names{numbers}; name them with ?classes={advice}")
     if len(names) != (len(names) if count is None else count):
-        raise ConfigError(
-            f"{where}: found {count} classes for {len(names)} names {list(names)}; expected one each"
-        )
+        raise ConfigError(f"{where}: found {count} classes, and {len(names)} names {list(names)}")
     return names
 
 

@@ -91,9 +91,7 @@ def _load(model: str) -> tuple[Any, Any]:
     is_folder = Path(model).is_dir()
     is_path = Path(model).exists() or model.startswith((".", "/", "~")) or model.count("/") > 1
     if is_path and not is_folder:
-        raise DataError(
-            f"hf:{model}: no such folder; expected one with config.json and the weights, or the name of a model"
-        )
+        raise DataError(f"hf:{model}: no such folder; expected one with config.json, or the name of a model")
     with _quiet(), errors_of_others(f"hf:{model}: cannot be read (", ")"):
         try:
             config = AutoConfig.from_pretrained(model, local_files_only=True, trust_remote_code=False)
@@ -103,14 +101,10 @@ def _load(model: str) -> tuple[Any, Any]:
         except OSError:
             if is_folder:
                 raise
-            raise DataError(
-                f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
-            ) from None
+            raise DataError(f"hf:{model}: not here; run `{program('hf')} download {model}`") from None
     unset = sorted([*report["missing_keys"], *report["mismatched_keys"]])
     if unset:
-        raise DataError(
-            f"hf:{model}: the file lacks {len(unset)} tensors of the network, such as {unset[:3]}"
-        )
+        raise DataError(f"hf:{model}: the file lacks {len(unset)} tensors of the network: {unset[:3]}")
     return config, network
 
 
@@ -119,9 +113,7 @@ def _kind(config: Any, model: str) -> Any:
         return AutoModelForUniversalSegmentation
     if type(config) in MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING:
         return AutoModelForSemanticSegmentation
-    raise DataError(
-        f"hf:{model}: a {config.model_type} is no segmentation network; expected one, such as segformer"
-    )
+    raise DataError(f"hf:{model}: {config.model_type} is no segmentation network, as segformer is")
 
 
 @contextmanager
@@ -219,9 +211,7 @@ def _task_tokens(model: str, config: Any) -> Tensor:
     masked: Tensor = tokens["input_ids"] * tokens["attention_mask"]
     # without its vocabulary a tokenizer gives every word the same token
     if len(masked.unique()) < len(TASK.split()):
-        raise DataError(
-            f"hf:{model}: its tokenizer does not know {TASK!r}; vocab.json and merges.txt are missing"
-        )
+        raise DataError(f"hf:{model}: its tokenizer does not know {TASK!r}; vocab.json, merges.txt?")
     return masked
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.pictures import LabelPixels, read_labels
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.files.untrusted import refused, shown
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, Taxonomy, shipped_taxonomies, taxonomy
 
 USUAL = "cityscapes"
@@ -57,9 +57,9 @@ class Meaning:
         unknown = np.unique(values[seen == UNKNOWN]).tolist()
         if unknown:
             found = [f"#{v:06x}" for v in unknown[:5]] if self.kind == COLOUR else f"ids {unknown[:20]}"
-            raise DataError(
-                f"{shown(path)}: found {found}, which are no {self.kind} of {self.source.name}; say what they are"
-                " (?ids=, ?taxonomy=; train --ids, --taxonomy)"
+            raise refused(
+                path,
+                f"found {found}, no {self.kind} of {self.source.name}; say what they are (ids, taxonomy)",
             )
         return seen
 
@@ -68,7 +68,7 @@ class Meaning:
         values = pixels.colours if self.kind == COLOUR else pixels.ids
         if values is None:
             found, expected = ("ids", "colours") if self.kind == COLOUR else ("colours", f"{self.kind} ids")
-            raise DataError(f"{where}: found {found}, expected {expected}, not {found}")
+            raise refused(where, f"found {found}, expected {expected}, not {found}")
         if values.dtype != np.uint16:
             return values
         values = np.where(values == 0xFFFF, np.uint16(255), values)  # -1: without a class
@@ -215,17 +215,16 @@ def _only(patterns: dict[str, list[Path]]) -> list[Path]:
     if others:
         names = [shown(files[0].name) for files in (first, *others)][:3]
         raise DataError(
-            f"labels {shown(first[0].parent)}: found files of several names, such as {names}; expected one kind: keep"
-            " them in two folders"
+            f"labels {shown(first[0].parent)}: found names such as {names}; keep kinds in two folders"
         )
     return first
 
 
 def _numbers(paths: list[Path]) -> dict[int, Path]:
     if all(TIME.fullmatch(path.stem) for path in paths):
-        raise DataError(
-            f"{shown(paths[0])}: named by a time, as {len(paths)} files are; expected the number of the frame: rename"
-            " them"
+        raise refused(
+            paths[0],
+            f"named by times, {len(paths)} files; expected frame numbers: rename them",
         )
     columns = np.array([re.findall(r"\d+", path.stem) for path in paths], object).T
     differ = [column for column in columns if len(set(column)) > 1]
@@ -233,8 +232,6 @@ def _numbers(paths: list[Path]) -> dict[int, Path]:
     files: dict[int, Path] = {}
     for path, text in zip(paths, chosen, strict=True):
         if int(text) in files:
-            raise DataError(
-                f"{shown(path)}: same frame as {shown(files[int(text)].name)}; expected one file per frame"
-            )
+            raise refused(path, f"same frame as {shown(files[int(text)].name)}; expected one file per frame")
         files[int(text)] = path
     return files

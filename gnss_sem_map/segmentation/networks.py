@@ -15,6 +15,7 @@ from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from gnss_sem_map.errors import ConfigError, DataError, errors_of_others
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.process.memory import reuse_memory
 from gnss_sem_map.segmentation.classes import VOID
 from gnss_sem_map.segmentation.pixels import checked_pixels, named, scaled
@@ -82,7 +83,7 @@ class NetworkSegmenter:
             else:
                 result = self._gpu_thread.submit(self._run, inputs, (height, width)).result()
         if not np.isfinite(result).all():
-            raise DataError(f"{where}: the network's probabilities are not finite; are its weights damaged?")
+            raise refused(where, "the network's probabilities are not finite; are its weights damaged?")
         return [np.ascontiguousarray(one) for one in result]
 
     def _run(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
@@ -122,9 +123,7 @@ def find_device(name: str) -> torch.device:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise ConfigError(
-            f"device {name!r}: {reason}; expected auto, cpu, cuda or another torch device"
-        ) from None
+        raise ConfigError(f"device {name!r}: {reason}; expected auto, cpu, cuda or the like") from None
     return device
 
 
@@ -134,9 +133,7 @@ def enough_memory(device: torch.device, advice: str) -> Iterator[None]:
     try:
         yield
     except torch.cuda.OutOfMemoryError:
-        raise DataError(
-            f"device {str(device)!r}: its memory is full; try {advice}, or another device"
-        ) from None
+        raise DataError(f"device {str(device)!r}: its memory is full; try {advice}") from None
 
 
 def for_inference(network: nn.Module, device: torch.device) -> nn.Module:

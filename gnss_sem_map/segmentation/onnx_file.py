@@ -13,7 +13,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError, errors_of_others
-from gnss_sem_map.files.untrusted import is_file, open_file, shown
+from gnss_sem_map.files.untrusted import is_file, open_file, refused, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import of_hard_labels, resized_softmax
 from gnss_sem_map.segmentation.classes import BY_COUNT, VOID, named_classes
@@ -60,9 +60,7 @@ class OnnxSegmenter:
         self._session = _open_session(path, device)
         self._mean, self._std = _three_numbers(mean, "mean", path), _three_numbers(std, "std", path)
         if order not in ("rgb", "bgr") or pixel_max not in ("1", "255") or not (self._std > 0).all():
-            raise ConfigError(
-                f"{path}: found order {order}, pixel_max {pixel_max}, std {std}; expected rgb|bgr, 1|255, positive"
-            )
+            raise ConfigError(f"{path}: {order=} {pixel_max=} {std=}; expected rgb|bgr, 1|255, above 0")
         self._order, self._unit = (
             (0, 1, 2) if order == "rgb" else (2, 1, 0),
             np.float32(255 / float(pixel_max)),
@@ -87,13 +85,11 @@ class OnnxSegmenter:
         with errors_of_others(f"{where}: "):
             answer = self._session.run([self._output], self._input.feed(seen))[0]
         if not np.isfinite(answer).all():
-            raise DataError(f"{where}: logits are not finite; is the normalisation right?")
+            raise refused(where, "logits are not finite; is the normalisation right?")
         if self._axis is None:
             ids = _plane(answer)
             if ids.ndim != 2 or (ids != np.rint(ids)).any():
-                raise DataError(
-                    f"{where}: found one channel of fractions, expected class ids or a channel per class"
-                )
+                raise refused(where, "found one channel of fractions, expected ids or a channel per class")
             known = np.where((ids >= 0) & (ids < len(self._table) - 1), ids, len(self._table) - 1)
             resized = cv2.resize(known.astype(np.int32), (width, height), interpolation=cv2.INTER_NEAREST)
             return np.asarray(self._table[resized])
@@ -143,9 +139,7 @@ def _open_session(path: Path, device: str) -> Any:
     )
     available = [provider for provider in wanted if provider in onnxruntime.get_available_providers()]
     if device.startswith("cuda") and "CUDAExecutionProvider" not in available:
-        raise ConfigError(
-            f"device {device!r}: this onnxruntime has no CUDA; pip install onnxruntime-gpu, or use cpu"
-        )
+        raise ConfigError(f"device {device!r}: no CUDA here; pip install onnxruntime-gpu, or use cpu")
     if device not in ("auto", "cpu") and not device.startswith("cuda"):
         raise ConfigError(f"device {device!r}: expected auto, cpu or cuda")
     options = onnxruntime.SessionOptions()
@@ -174,8 +168,7 @@ def _probed(session: Any, path: Path, told: int) -> tuple[_Input, str, int | Non
             return port, name, None, None
     found = [(name, answer.dtype.name, answer.shape) for name, answer in outputs]
     raise DataError(
-        f"onnx {path}: found outputs {found}, expected float (1, classes, height, width) or (1, height, width,"
-        " classes), or class ids (1, height, width)"
+        f"onnx {path}: found outputs {found}, expected float (1, classes, h, w) or (1, h, w, classes), or ids"
     )
 
 
@@ -189,9 +182,7 @@ def _input_of(session: Any, path: Path) -> _Input:
     dtype, ends = DTYPES.get(inputs[0].type), shape[1:4:2]
     if len(inputs) != 1 or dtype is None or len(shape) != 4 or not (3 in ends or ends == [None, None]):
         found = [(i.name, i.type, i.shape) for i in inputs]
-        raise DataError(
-            f"onnx {path}: found inputs {found}, expected one of float (1, 3, height, width) or (1, height, width, 3)"
-        )
+        raise DataError(f"onnx {path}: found {found}, expected one: float (1, 3, h, w) or (1, h, w, 3)")
     last = ends[0] != 3 and (ends[1] == 3 or str(inputs[0].shape[-1:]).lower().startswith("['c"))
     size = (shape[1], shape[2]) if last else (shape[2], shape[3])
     return _Input(inputs[0].name, np.dtype(dtype), last, shape[0] or 1, size)
@@ -215,7 +206,5 @@ def _three_numbers(text: str, name: str, path: Path) -> NDArray[np.float32]:
         if numbers.shape != (3,) or not np.isfinite(numbers).all():
             raise ValueError
     except ValueError:
-        raise ConfigError(
-            f"onnx {path}: found {name}={text}, expected three numbers joined by commas"
-        ) from None
+        raise ConfigError(f"onnx {path}: found {name}={text}, expected three numbers: a,b,c") from None
     return numbers

@@ -24,8 +24,7 @@ def checked_pixels(image: Image) -> NDArray[np.uint8]:
     pixels = image.read()
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
         raise DataError(
-            f"image {image.number}: found {pixels.dtype} {pixels.shape}, expected RGB pixels (h, w, 3) of uint8;"
-            " convert grey or 16-bit images first"
+            f"image {image.number}: found {pixels.dtype} {pixels.shape}, expected RGB (h, w, 3) uint8"
         )
     return pixels
 
@@ -51,9 +50,7 @@ def scaled(
 
     height, width = (side - side % shrink for side in pixels.shape[:2])
     if min(height, width) == 0:
-        raise DataError(
-            f"found an image of {pixels.shape[1]} x {pixels.shape[0]} pixels, expected at least {shrink}"
-        )
+        raise DataError(f"found {pixels.shape[1]} x {pixels.shape[0]} pixels, expected {shrink} or more")
     cut = np.ascontiguousarray(pixels[:height, :width])
     wanted = int(np.ceil(height * scale)), int(np.ceil(width * scale))
     wanted = wanted if to_whole is None else to_whole(*wanted)
@@ -73,7 +70,5 @@ def scale_and_shrink(
         if not (0.1 <= as_scale <= 4 and 1 <= as_shrink <= 16):
             raise ValueError
     except ValueError:
-        raise ConfigError(
-            f"{where}: found scale {scale}, shrink {shrink}; expected 0.1 to 4, and a whole number from 1 to 16"
-        ) from None
+        raise ConfigError(f"{where}: found {scale=}, {shrink=}; expected 0.1 to 4, and 1 to 16") from None
     return as_scale, as_shrink

@@ -31,9 +31,7 @@ class PythonSegmenter:
         if own is not None and not (isinstance(own, Sequence) and all(isinstance(name, str) for name in own)):
             raise ConfigError(f"{self._where}: found class_names {str(own)[:100]}, expected a list of names")
         if classes is None and own is None:
-            raise ConfigError(
-                f"{self._where} has no class_names; give it that attribute, or use ?classes=road,..."
-            )
+            raise ConfigError(f"{self._where} has no class_names; set them, or use ?classes=road,...")
         names = named_classes(classes, None if own is None else len(own), label_set, self._where, own)
         self._count, self._kept = len(names), [i for i, name in enumerate(names) if name != VOID]
         self.class_names = tuple(names[i] for i in self._kept)
@@ -62,9 +60,7 @@ def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
     except AttributeError:
         raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
     except Exception as error:  # and so may the import of its module
-        raise ConfigError(
-            f"python:{place}: cannot be imported, {type(error).__name__} {one_line(error)}"
-        ) from error
+        raise ConfigError(f"python:{place}: cannot be imported ({one_line(error)})") from error
     if not callable(function):
         raise ConfigError(f"python:{place}: found {type(function).__name__}, expected a callable")
     return cast("Callable[[NDArray[np.uint8]], Any]", function)

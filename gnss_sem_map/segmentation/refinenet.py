@@ -41,9 +41,7 @@ def LightWeightRefineNet(
     if backbone == "mobilenet_v2":
         return MobileNetRefineNet(num_classes, **layout)
     if layout:
-        raise ConfigError(
-            f"Light-Weight RefineNet on {backbone}: unknown {sorted(layout)}; they are for mobilenet_v2"
-        )
+        raise ConfigError(f"Light-Weight RefineNet on {backbone}: {sorted(layout)} are of mobilenet_v2")
     return ResNetRefineNet(num_classes, backbone, light_weight=True)
 
 
@@ -107,9 +105,7 @@ class ResNetRefineNet(ResNet):
 
     def __init__(self, num_classes: int, backbone: str, light_weight: bool) -> None:
         if backbone not in RESNET_BLOCKS:
-            raise ConfigError(
-                f"RefineNet: unknown backbone {backbone!r}; expected one of {list(RESNET_BLOCKS)}"
-            )
+            raise ConfigError(f"RefineNet: unknown backbone {backbone!r}; expected {list(RESNET_BLOCKS)}")
         super().__init__(RESNET_BLOCKS[backbone])
         kernel = 1 if light_weight else 3
         widths = (COARSEST_WIDTH, COMMON_WIDTH, COMMON_WIDTH, COMMON_WIDTH)

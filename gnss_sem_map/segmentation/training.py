@@ -19,11 +19,12 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.functional import cross_entropy, interpolate
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.ownership import MARKER, write_list
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.process.machine import threads
 from gnss_sem_map.process.prefetch import prefetch
@@ -35,7 +36,7 @@ from gnss_sem_map.segmentation.checkpoints import (
     read_checkpoint,
     write_network,
 )
-from gnss_sem_map.segmentation.networks import enough_memory, find_device, placed
+from gnss_sem_map.segmentation.networks import enough_memory, find_device, normalised, placed
 from gnss_sem_map.segmentation.pixels import scaled
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 from gnss_sem_map.segmentation.training_data import (
@@ -134,19 +135,15 @@ def mean_iou(
     network: nn.Module, data: LabelledImages, scale: float, device: torch.device
 ) -> tuple[float, NDArray[np.float64]]:
     """Mean intersection over union of the map's classes (`other` is none of them), and that of every class, (c,)."""
-    count = len(data.class_names)
+    count, prepare = len(data.class_names), normalised(MEAN, STD, device)
     confusion = np.zeros((count, count), np.int64)
     network.eval()
     for index in range(len(data.pairs)):
         pixels, truth = data.read(index)
         with torch.inference_mode():
-            logits = network(_to_input(scaled(pixels, 1, scale)[None], device))
-            seen = (
-                interpolate(logits, truth.shape, mode="bilinear", align_corners=False)
-                .argmax(1)[0]
-                .cpu()
-                .numpy()
-            )
+            logits = network(prepare(scaled(pixels, 1, scale)[None]))
+            enlarged = interpolate(logits, truth.shape, mode="bilinear", align_corners=False)
+            seen = enlarged.argmax(1)[0].cpu().numpy()
         valid = truth != IGNORE
         confusion += np.bincount(count * truth[valid].astype(int) + seen[valid], minlength=count**2).reshape(
             count, count
@@ -154,9 +151,7 @@ def mean_iou(
     either = confusion.sum(0) + confusion.sum(1) - confusion.diagonal()
     iou = np.where(confusion.sum(1) > 0, confusion.diagonal() / np.maximum(either, 1), np.nan)
     if np.isnan(iou[:-1]).all():
-        raise DataError(
-            f"{data.pairs[0][1].parent}: found none of {data.class_names[:-1]} in the validation labels"
-        )
+        raise DataError(f"{data.pairs[0][1].parent}: no {data.class_names[:-1]} in the validation labels")
     return float(np.nanmean(iou[:-1])), iou
 
 
@@ -168,6 +163,7 @@ class _Run:
         out: Path, resume: bool,
     ) -> None:  # fmt: skip
         self.settings, self.device, self._data, self._out = settings, device, data, out
+        self._prepare = normalised(MEAN, STD, device)
         torch.manual_seed(settings.seed)
         self.network = placed(_first_network(settings, data.class_names, initial), device)
         self._optimiser = torch.optim.AdamW(
@@ -201,14 +197,12 @@ class _Run:
         self._optimiser.zero_grad()
         mixed = self._precision is not torch.float32
         with torch.autocast(self.device.type, self._precision, enabled=mixed):
-            logits = self.network(_to_input(pixels, self.device))
+            logits = self.network(self._prepare(pixels))
         enlarged = interpolate(logits.float(), truth.shape[1:], mode="bilinear", align_corners=False)
         target = torch.from_numpy(truth).to(self.device).long()
         loss = cross_entropy(enlarged, target, self._weights, ignore_index=IGNORE)
         if not torch.isfinite(loss):
-            raise DataError(
-                f"{self._out}: the loss of step {step} is not finite; lower the learning rate, or raise the precision"
-            )
+            raise DataError(f"{self._out}: the loss of step {step} is not finite; lower the learning_rate")
         self._scaler.scale(loss).backward()
         self._scaler.unscale_(self._optimiser)
         nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -255,17 +249,13 @@ class _Run:
         try:
             state: dict[str, Any] = torch.load(path, map_location=self.device, weights_only=True)
         except LOAD_ERRORS as error:
-            raise DataError(
-                f"{path}: damaged ({type(error).__name__}); remove the folder and train again"
-            ) from None
+            raise refused(path, f"damaged ({type(error).__name__}); remove it, train again") from None
         expected = self.settings.model_dump(mode="json")
         changed = {
             n: (state["settings"].get(n), v) for n, v in expected.items() if state["settings"].get(n) != v
         }
         if changed or state["class_names"] != list(self._data.class_names):
-            raise ConfigError(
-                f"{path}: was started with other settings (then, now): {changed}; resume with the same ones"
-            )
+            raise ConfigError(f"{path}: other settings then and now: {changed}; resume with the same ones")
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self._scaler.load_state_dict(state["scaler"])
@@ -325,12 +315,6 @@ def _from_checkpoint(path: Path, class_names: tuple[str, ...]) -> nn.Module:
     return network
 
 
-def _to_input(pixels: NDArray[np.uint8], device: torch.device) -> Tensor:
-    batch = torch.from_numpy(pixels).to(device).permute(0, 3, 1, 2).float() / 255
-    mean, std = (torch.tensor(v, device=device).reshape(3, 1, 1) for v in (MEAN, STD))
-    return (batch - mean) / std
-
-
 def _claim(out: Path) -> None:
     """Make the folder of a training; raises ConfigError for one with other files."""
     with _writing(out):
@@ -339,9 +323,7 @@ def _claim(out: Path) -> None:
         strange = sorted({path.name for path in out.iterdir()} - own)
         ours = (out / STATE).exists() or ((out / MARKER).exists() and not strange)  # a run has a list, too
         if any(out.iterdir()) and not ours:
-            raise ConfigError(
-                f"{out}: holds {(strange or [NETWORK])[0]} and no training; choose an empty folder"
-            )
+            raise ConfigError(f"{out}: holds {(strange or [NETWORK])[0]}, no training; choose another folder")
         if not ours:
             write_list(out)
 
@@ -350,13 +332,9 @@ def _claim(out: Path) -> None:
 def _writing(out: Path) -> Iterator[None]:
     try:
         yield
-    except (
-        OSError,
-        RuntimeError,
-        SafetensorError,
-    ) as error:  # the last two are of torch and safetensors
+    except (OSError, RuntimeError, SafetensorError) as error:  # the last two are of torch and safetensors
         reason = str(error).splitlines()[0]
-        raise DataError(f"{out}: cannot be written ({reason}); free some space there, then resume") from None
+        raise refused(out, f"cannot be written ({reason}); free some space there, then resume") from None
 
 
 def _append_row(path: Path, header: list[str], row: list[object]) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.pictures import read_picture
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.labels.label_set import OTHER, LabelSet, taxonomy
 from gnss_sem_map.segmentation.label_images import VOID, Meaning, reading
 
@@ -38,9 +39,7 @@ class LabelledFolder:
         parts = text.split(",")
         every = parts[2] if len(parts) == 3 else "1"
         if len(parts) not in (2, 3) or not all(parts) or not every.isdecimal() or int(every) < 1:
-            raise ConfigError(
-                f"found {text!r}, expected IMAGES,LABELS or IMAGES,LABELS,EVERY with EVERY from 1"
-            )
+            raise ConfigError(f"found {text!r}, expected IMAGES,LABELS[,EVERY] with EVERY from 1")
         return cls(Path(parts[0]), Path(parts[1]), int(every))
 
 
@@ -58,8 +57,9 @@ class LabelledImages:
         pixels = read_picture(image_file, needs_colour=True)
         classes = self.meaning.read(label_file)
         if pixels.shape[:2] != classes.shape:
-            raise DataError(
-                f"{label_file}: found {classes.shape} pixels, expected {pixels.shape[:2]} as in {image_file.name}"
+            raise refused(
+                label_file,
+                f"found {classes.shape}, {image_file.name} has {pixels.shape[:2]}",
             )
         return pixels, classes
 
@@ -84,8 +84,7 @@ def _pairs(folder: LabelledFolder, ids: str) -> list[tuple[Path, Path]]:
     without = [image.name for image, label in pairs if not label.is_file()]
     if not pairs or without:
         raise DataError(
-            f"{folder.images}: found {len(pairs)} images, {len(without)} without a PNG of the same name in"
-            f" {folder.labels} ({without[:3]}); expected one for each"
+            f"{folder.images}: {len(pairs)} images, {len(without)} without labels in {folder.labels} ({without[:3]})"
         )
     return pairs
 
@@ -105,9 +104,7 @@ def class_weights(data: LabelledImages, samples: int = 64) -> NDArray[np.float32
         counts += np.bincount(data.read(int(index))[1].ravel(), minlength=256)
     counts = counts[: len(data.class_names)]
     if not counts.any():
-        raise DataError(
-            f"{data.pairs[0][1].parent}: found no pixel of any class; expected labels of {data.class_names}"
-        )
+        raise DataError(f"{data.pairs[0][1].parent}: found no pixel of {data.class_names}")
     weights = 1 / np.log(1.02 + counts / counts.sum())
     return np.asarray(weights / weights.mean(), np.float32)
 

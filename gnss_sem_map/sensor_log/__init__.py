@@ -9,7 +9,7 @@ from __future__ import annotations
 import bisect
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -26,13 +26,15 @@ from factor_graphs.measurements import (
     GnssVelocities,
     ImuNoise,
     ImuSamples,
+    Repairs,
     WheelSpeeds,
 )
 from factor_graphs.settings import SampleInstant
 from factor_graphs.surveyed_points import SurveyedPoints
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.sensor_log.cameras import NAME, Camera, is_rigid
+from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.sensor_log.cameras import NAME, Camera, check_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 
@@ -51,7 +53,7 @@ class Points:
         n = len(self.xyz)
         if self.xyz.shape != (n, 3) or self.intensity.shape != (n,):
             raise DataError(
-                f"points: found shapes {self.xyz.shape} and {self.intensity.shape}, expected (n, 3) and (n,)"
+                f"points: found {self.xyz.shape} and {self.intensity.shape}, expected (n, 3), (n,)"
             )
         if self.stamps is not None and self.stamps.shape != (n,):
             raise DataError(f"points: found {self.stamps.shape} stamps for {n} points, expected one each")
@@ -133,11 +135,7 @@ class Calibration:
     """(3,) m: the GNSS antenna in the imu frame."""
 
     def __post_init__(self) -> None:
-        if not is_rigid(self.T_imu_lidar):
-            raise DataError(
-                f"calibration: T_imu_lidar is no rigid transform (found shape {np.shape(self.T_imu_lidar)},"
-                " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
-            )
+        check_rigid(self.T_imu_lidar, ": T_imu_lidar")
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names) or (len(names) > 1 and "" in names):
             raise DataError(f"calibration: found cameras {names}, expected names, all different")
@@ -176,6 +174,16 @@ class Skip:
     reason: str
     frames: int = 1
     """Number of frames, rows or files."""
+
+
+def skipped(what: str, where: object, noun: str, counts: Mapping[str, int]) -> list[Skip]:
+    """A skip for every reason, of so many things."""
+    return [Skip(what, shown(where), f"{n} {noun}: {why}", n) for why, n in counts.items()]
+
+
+def repaired(where: object, *repairs: Repairs | None) -> list[Skip]:
+    """A skip for every sensor of whose rows some were dropped."""
+    return [Skip("samples", shown(where), str(one)) for one in repairs if one is not None and one.dropped]
 
 
 SENSOR = "sensor"
@@ -237,9 +245,7 @@ class SensorLog:
             or not all(re.fullmatch(NAME, name) for name in names)
             or (self.others and "" in names)
         ):
-            raise DataError(
-                f"{self.name}: found LiDARs {names}, expected names of letters, digits, _ and -, all different"
-            )
+            raise DataError(f"{self.name}: found LiDARs {names}, expected letters, digits, _, -, once")
         stamps = {"scans": [scan.stamp for scan in self.scans]}
         for lidar in self.others:
             stamps[f"scans of {lidar.name}"] = [scan.stamp for scan in lidar.scans]
@@ -247,17 +253,13 @@ class SensorLog:
             stamps[f"images of {name}" if name else "images"] = found
         for what, some in stamps.items():
             if any(b <= a for a, b in pairwise(some)):
-                raise DataError(
-                    f"{self.name}: stamps of the {what} do not increase; sort and remove repeats first"
-                )
+                raise DataError(f"{self.name}: stamps of {what} do not increase; sort them, remove repeats")
 
     def check_located(self) -> None:
         """Raise DataError when neither poses nor IMU with GNSS say where the vehicle was."""
         if self.given is None and (self.imu is None or self.gnss is None):
             lost = next((f"{skip.where}: {skip.reason}" for skip in self.skips if skip.what == SENSOR), None)
-            raise DataError(
-                lost or f"{self.name}: found neither poses nor IMU with GNSS; expected one of them"
-            )
+            raise DataError(lost or f"{self.name}: expected poses, or IMU and GNSS")
 
     @property
     def folders(self) -> set[Path]:
@@ -318,8 +320,7 @@ class SensorLog:
             of = f" of {self.lidar}" if self.lidar else ""
             why = next((f" ({skip.where}: {skip.reason})" for skip in self.skips if skip.what == "scan"), "")
             raise DataError(
-                f"{self.name}: has no LiDAR scan{of} to map, or none that --frames names{why}; for the trajectory"
-                " alone: gnss-sem-map trajectory"
+                f"{self.name}: has no LiDAR scan{of}, or none that --frames names{why}; `trajectory` needs none"
             )
 
     @property

@@ -68,9 +68,7 @@ class Distortion(BaseModel):
         counts = COEFFICIENTS[self.model]
         if len(self.coefficients) not in counts:
             expected = " or ".join(map(str, counts))
-            raise ValueError(
-                f"found {len(self.coefficients)} coefficients, expected {expected} for {self.model}"
-            )
+            raise ValueError(f"found {len(self.coefficients)} coefficients, not {expected}: {self.model}")
         if self.xi and self.model != "mei":
             raise ValueError(f"found xi {self.xi} for {self.model}; only mei has it")
         return self
@@ -169,18 +167,10 @@ class Camera:
     def __post_init__(self) -> None:
         of = f" of camera {self.name}" if self.name else ""
         if not re.fullmatch(NAME, self.name):
-            raise DataError(
-                f"calibration: found a camera {self.name!r}, expected letters, digits, _ and -; folders have its name"
-            )
-        if not is_rigid(self.T_camera_lidar):
-            raise DataError(
-                f"calibration{of}: T_camera_lidar is no rigid transform (found shape {np.shape(self.T_camera_lidar)},"
-                " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
-            )
+            raise DataError(f"calibration: found a camera {self.name!r}, expected letters, digits, _ and -")
+        check_rigid(self.T_camera_lidar, f"{of}: T_camera_lidar")
         if self.K.shape != (3, 3) or self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
-            raise DataError(
-                f"calibration{of}: found intrinsics {self.K.tolist()}, expected 3 x 3 with positive focal lengths"
-            )
+            raise DataError(f"calibration{of}: found K {self.K.tolist()}, expected focal lengths above 0")
 
     def projection(self, T_camera_source: Array) -> Array:
         """What takes points to this camera (3, 4): to its pixels where it has no distortion, else into its frame."""
@@ -202,10 +192,7 @@ class Camera:
 
 def lidar_to_camera(T_imu_camera: Array, T_imu_lidar: Array) -> Array:
     """T_camera_lidar (4, 4) of a camera whose pose in the imu frame is known."""
-    if not is_rigid(T_imu_camera):
-        raise DataError(
-            "calibration: T_imu_camera is no rigid transform, expected 4 x 4, rotation orthonormal to 1e-3"
-        )
+    check_rigid(T_imu_camera, ": T_imu_camera")
     return np.asarray(np.linalg.inv(T_imu_camera) @ T_imu_lidar, np.float64)
 
 
@@ -216,3 +203,10 @@ def is_rigid(T: Array, tolerance: float = 1e-3) -> bool:
     R = T[:3, :3]
     with np.errstate(all="ignore"):  # of numbers that are no rotation's
         return bool(np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)
+
+
+def check_rigid(T: Array, what: str) -> None:
+    """Raise DataError unless a transform of the calibration is rigid; `what` says which."""
+    if not is_rigid(T):
+        found = f"found shape {np.shape(T)}, expected 4 x 4, rotation orthonormal to 1e-3"
+        raise DataError(f"calibration{what} is no rigid transform ({found}); check the calibration file")

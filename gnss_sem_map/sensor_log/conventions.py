@@ -89,11 +89,8 @@ class SensorConventions(BaseModel):
 
     def imu_in_ours(self, imu: ImuSamples) -> ImuSamples:
         """The same samples in our axes and units; the very same object where nothing is to be done."""
-        force, rate = (self._to_ours(axes) for axes in (self.force_axes, self.rate_axes))
-        force, rate = (
-            force * FORCE_UNITS[self.force_unit or "m/s2"],
-            rate * RATE_UNITS[self.rate_unit or "rad/s"],
-        )
+        force = self._to_ours(self.force_axes) * FORCE_UNITS[self.force_unit or "m/s2"]
+        rate = self._to_ours(self.rate_axes) * RATE_UNITS[self.rate_unit or "rad/s"]
         if np.array_equal(force, np.eye(3)) and np.array_equal(rate, np.eye(3)):
             return imu
         return ImuSamples(imu.stamps, imu.specific_force @ force.T, imu.angular_rate @ rate.T)
@@ -108,9 +105,8 @@ class SensorConventions(BaseModel):
 
     def on_our_clock(self, of_receiver: OfReceiver) -> OfReceiver:
         """The same measurements of the receiver on our clock."""
-        if not self.gnss_time_offset_s:
-            return of_receiver
-        return replace(of_receiver, stamps=of_receiver.stamps + self.gnss_time_offset_s)
+        late = self.gnss_time_offset_s
+        return replace(of_receiver, stamps=of_receiver.stamps + late) if late else of_receiver
 
     def wheels_in_ours(self, wheels: WheelSpeeds) -> WheelSpeeds:
         """The same wheel speeds in our unit."""

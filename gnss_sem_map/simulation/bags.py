@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.kitti_calibration import quaternion_of
-from gnss_sem_map.datasets.ros.decoding import typestore
+from gnss_sem_map.datasets.ros.kinds import typestore
 from gnss_sem_map.datasets.ros.static_tf import STATIC
 from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.sensor_log.cameras import Distortion

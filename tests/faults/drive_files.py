@@ -137,7 +137,7 @@ def picture(suffix: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     """A camera image."""
     import cv2
 
-    from gnss_sem_map.datasets.frames import read_image
+    from gnss_sem_map.files.pictures import read_picture as read_image
 
     folder.mkdir(parents=True)
     file = folder / f"0{suffix}"

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from factor_graphs.receiver_rows import with_more
 from gnss_sem_map.datasets.gnss_files import named_columns, nmea, other_formats, rtklib, sbet
-from gnss_sem_map.datasets.gnss_files.positions import Positions
+from gnss_sem_map.datasets.gnss_files.positions import Positions, rows_of
 from gnss_sem_map.datasets.gnss_files.time_systems import LEAP_S, gps_minus_utc_s
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.geoid import undulation
-from gnss_sem_map.files.untrusted import is_file, read_bytes, read_lines, shown
+from gnss_sem_map.files.untrusted import is_file, read_bytes, read_lines, refused, shown
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -86,11 +84,8 @@ def read_gnss_file(
     stamps_ns = _on_unix_clock(found, about)
     if drive_ns is not None:
         _check_overlap(path, stamps_ns, drive_ns)
-    stddevs = found.stddevs if about.stddevs_m is None else np.tile(about.stddevs_m, (len(stamps_ns), 1))
     zero = int(stamps_ns[0]) if epoch_ns is None else epoch_ns
-    rows = np.column_stack([(stamps_ns - zero) * 1e-9, found.geodetic, stddevs])
-    more = found.more if about.stddevs_m is None else found.more | {"correlations": np.full((1, 3), np.nan)}
-    return FileFixes(with_more(rows, **more), stamps_ns, found.skips)
+    return FileFixes(rows_of(found, zero, stamps_ns, about.stddevs_m), stamps_ns, found.skips)
 
 
 def _read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
@@ -105,7 +100,7 @@ def _read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: b
     if nmea.is_nmea(lines) or (ending in OF_NMEA and content.startswith(b"$")):
         return nmea.read(path, lines, near_ns)
     if why := other_formats.no_positions(content):
-        raise DataError(f"{shown(path)}: {why}")
+        raise refused(path, f"{why}")
     if ending in OF_NMEA:
         return nmea.read(path, lines, near_ns)
     return named_columns.read(path, other_formats.as_table(content), near_ns, has_stddevs)
@@ -117,17 +112,16 @@ def _above_ellipsoid(path: Path, found: Positions, geoid: float | str | None, fo
     if above is None or not above.any():
         return found
     if geoid is None and above.all():
-        raise DataError(
-            f"{shown(path)}: heights are above the geoid, expected above the ellipsoid; set `geoid:` to the height of"
-            " the geoid there, m, or to its grid (.tif, .gtx)"
+        raise refused(
+            path,
+            "heights are above the geoid; set `geoid:` to its height, m, or to its grid (.tif, .gtx)",
         )
     if geoid is None:
         why = f"{int(above.sum())} fixes: height above a geoid of unknown height; `geoid:` tells it"
         found.skips.append(Skip("fix", shown(path), why, int(above.sum())))
-        more = {name: values[~above] for name, values in found.more.items()}
         return replace(
             found, stamps_ns=found.stamps_ns[~above], geodetic=found.geodetic[~above], stddevs=found.stddevs[~above],
-            more=more,
+            more={name: values[~above] for name, values in found.more.items()},
         )  # fmt: skip
     lat, lon, height = found.geodetic.T
     if isinstance(geoid, str):
@@ -135,7 +129,7 @@ def _above_ellipsoid(path: Path, found: Positions, geoid: float | str | None, fo
             lon, lat, height, direction="INVERSE"
         )
         if not np.isfinite(raised[above]).all():
-            raise DataError(f"{shown(path)}: the grid {geoid[:100]} does not cover its positions")
+            raise refused(path, f"the grid {geoid[:100]} does not cover its positions")
     else:
         raised = height + geoid
     return replace(found, geodetic=np.column_stack([lat, lon, np.where(above, raised, height)]))
@@ -145,11 +139,9 @@ def _inside(folder: Path, name: str) -> Path:
     """A file in a folder; raises DataError for one that is elsewhere or missing."""
     path = folder / name
     if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise DataError(
-            f"{shown(folder)}: found the GNSS file {name[:100]!r}, expected a path within this folder"
-        )
+        raise refused(folder, f"found the GNSS file {name[:100]!r}, expected a path within this folder")
     if not is_file(path):
-        raise DataError(f"{shown(path)}: no such file; expected positions of the receiver")
+        raise refused(path, "no such file; expected positions of the receiver")
     return path
 
 
@@ -170,7 +162,8 @@ def _check_overlap(path: Path, stamps_ns: NDArray[np.int64], drive_ns: tuple[int
     near = min((hours, hours - LEAP_S, hours + LEAP_S), key=lambda s: abs(late_s - s))
     slack_s = (last - first + drive_ns[1] - drive_ns[0]) / 2e9
     fits = hours and abs(hours) <= LONGEST_OFFSET_S and abs(late_s - near) <= slack_s
-    raise DataError(
-        f"{shown(path)}: no fix lies within the drive: the fixes are {late_s:.0f} s after it (middle to middle);"
-        + (f" is it local time? set utc_offset_s: {hours}" if fits else " is it the file of this drive?")
+    raise refused(
+        path,
+        f"no fix lies within the drive: the fixes are {late_s:.0f} s after it (middle to middle);"
+        + (f" is it local time? set utc_offset_s: {hours}" if fits else " is it the file of this drive?"),
     )

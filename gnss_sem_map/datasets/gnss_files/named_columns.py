@@ -29,8 +29,7 @@ from gnss_sem_map.datasets.gnss_files.positions import (
 from gnss_sem_map.datasets.gnss_files.sbet import over_weeks
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, GPS_EPOCH_NS, WEEK_NS, nearest
 from gnss_sem_map.datasets.stamps import LAST_YEAR
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import MOST_LINES, shown
+from gnss_sem_map.files.untrusted import MOST_LINES, refused, shown
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -103,9 +102,7 @@ def read(path: Path, content: bytes, near_ns: int | None, has_stddevs: bool) -> 
     is_flat = not ({"alt_m", "msl_m", "x_m"} & table.columns.keys())
     told = STDDEVS[:2] if is_flat else STDDEVS
     if not table.has(*told) and not has_stddevs:
-        raise DataError(
-            f"{shown(path)}: {table.layout.shown} does not tell its accuracy; set `stddevs_m: [east, north, up]`"
-        )
+        raise refused(path, f"{table.layout.shown} tells no accuracy; set `stddevs_m: [east, north, up]`")
     places, above_geoid = _places(table, path)
     stddevs = np.column_stack(
         [table.numbers(name) if table.has(*told, name) else np.ones(len(rows)) for name in STDDEVS]
@@ -114,9 +111,7 @@ def read(path: Path, content: bytes, near_ns: int | None, has_stddevs: bool) -> 
         stddevs[:, 2] = FLAT_STDDEV_M
     known = np.isfinite(places).all(axis=1) & np.isfinite(stddevs).all(axis=1)
     if not known.any():
-        raise DataError(
-            f"{shown(path)}: found no position among {count} rows of {table.layout.shown}; {EXPECTED}"
-        )
+        raise refused(path, f"found no position among {count} rows of {table.layout.shown}; {EXPECTED}")
     lost += int((~known).sum())
     skips = [Skip("fix", shown(path), f"{lost} rows without a time or a place", lost)] if lost else []
     skips += [without_heights(shown(path), int(known.sum()))] if is_flat else []
@@ -131,11 +126,11 @@ def _opened(path: Path, content: bytes) -> _Table:
         layout = layout_of(content, NAMED)
         found = {name: layout.column(name) for name in NAMED}
     except MeasurementError as error:
-        raise DataError(f"{shown(path)}: {error}") from None
+        raise refused(path, f"{error}") from None
     lines = bytes(layout.rows).decode("utf-8", "replace").split("\n")[1:]
     lines = [line for line in lines if line.strip()]
     if len(lines) > MOST_LINES:
-        raise DataError(f"{shown(path)}: found {len(lines)} lines, expected at most {MOST_LINES}")
+        raise refused(path, f"found {len(lines)} lines, expected at most {MOST_LINES}")
     columns = {name: column for name, column in found.items() if column is not None}
     if not lines or not ({"lat_deg", "lat_d", "x_m"} & columns.keys()):
         projected = {"easting_m", "northing_m"} & {name for name in NAMES if layout.column(name) is not None}
@@ -145,7 +140,7 @@ def _opened(path: Path, content: bytes) -> _Table:
             else ""
         )
         why = why or layout.missing("lat_deg", ("time", "latitude", "longitude", "altitude"))
-        raise DataError(f"{shown(path)}: {why if lines else 'empty'}; {EXPECTED}")
+        raise refused(path, f"{why if lines else 'empty'}; {EXPECTED}")
     if layout.decimal == ",":
         lines = [line.replace(",", ".") for line in lines]
     cells = len(lines[0].split(layout.separator))
@@ -158,7 +153,7 @@ def _places(table: _Table, path: Path) -> tuple[Array, bool]:
         return geodetic_of_ecef(np.column_stack([table.numbers(name) for name in GEOCENTRIC])), False
     angles = [_angles(table, name) for name in ANGLES if table.has(name) or table.has(*PARTS[name])]
     if len(angles) < len(ANGLES):
-        raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
+        raise refused(path, f"found {table.layout.shown}; {EXPECTED}")
     if not ({"alt_m", "msl_m"} & table.columns.keys()):
         return np.column_stack([*angles, np.zeros(len(table.lines))]), False
     if table.has("alt_m"):
@@ -187,7 +182,7 @@ def _moments(table: _Table, near_ns: int | None, path: Path) -> tuple[Array, Sys
         return GPS_EPOCH_NS * 1e-9 + table.numbers("week") * WEEK_S + table.numbers("sow"), "gps"
     name = next((name for name in ("sow", "clock", "stamp_s", "date") if table.has(name)), None)
     if name is None:
-        raise DataError(f"{shown(path)}: found {table.layout.shown}; {EXPECTED}")
+        raise refused(path, f"found {table.layout.shown}; {EXPECTED}")
     texts = table.texts(name)
     label = table.layout.header[table.columns[name].at].lower()
     is_gps = name == "sow" or label.startswith(("gps", "hr"))  # CSRS-PPP has GPS time
@@ -211,9 +206,7 @@ def _nearest(
 ) -> tuple[Array, System]:
     """Times of a day of UTC, or of a GPS week, on the day or week nearest to a moment."""
     if near_ns is None:
-        raise DataError(
-            f"{shown(path)}: tells neither date nor week, and no other sensor of this log does; add a column Week"
-        )
+        raise refused(path, "tells neither date nor week, nor does another sensor; add a column Week")
     times, start, period = clock[known], GPS_EPOCH_NS, WEEK_NS
     if is_of_day:
         times, start, period = (

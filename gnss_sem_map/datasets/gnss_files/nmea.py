@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import datetime
 import re
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import reduce
 from importlib.util import find_spec
 from operator import xor
@@ -22,9 +24,9 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.gnss_files.positions import FLAT_STDDEV_M, Positions, without_heights
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, WEEK_NS, nearest
-from gnss_sem_map.errors import DataError, how_to_install
-from gnss_sem_map.files.untrusted import shown
-from gnss_sem_map.sensor_log import Skip
+from gnss_sem_map.errors import how_to_install
+from gnss_sem_map.files.untrusted import refused, shown
+from gnss_sem_map.sensor_log import Skip, skipped
 
 STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0.3, 0.5)}
 """Horizontal and vertical, m, at a HDOP of 1: autonomous, differential, PPS, fixed and float RTK. Other qualities are
@@ -58,51 +60,47 @@ def is_nmea(lines: list[str]) -> bool:
 def read(path: Path, lines: list[str], near_ns: int | None) -> Positions:
     """The positions of a file; what is no fix is skipped and counted. Raises DataError where there is none."""
     if find_spec("pynmeagps") is None:
-        raise DataError(f"{shown(path)}: NMEA needs pynmeagps; {how_to_install('ros')}")
+        raise refused(path, f"NMEA needs pynmeagps; {how_to_install('ros')}")
     now: int | None = None  # by the last sentence with a date
     deviations: dict[int, tuple[float, float, float]] = {}
     velocities: dict[int, tuple[float, float]] = {}
     headings: dict[int, float] = {}
     clock: int | None = None  # of the last sentence with a time
-    fixes: list[Fix] = []
-    flat: list[Fix] = []
-    lost: dict[str, int] = {}
+    fixes, flat, lost = list[Fix](), list[Fix](), Counter[str]()
     for sentence in _sentences(lines):
         if isinstance(sentence, str):
-            lost[sentence] = lost.get(sentence, 0) + 1
+            lost[sentence] += 1
             continue
         if sentence.msgID not in TIMELESS:
             clock = _clock_ns(sentence.time)
+        if sentence.msgID in ("RMC", "ZDA"):
+            now = _moment_ns(sentence) or now
         if clock is not None and (velocity := _velocity(sentence)) is not None:
             velocities[clock] = velocity
         if clock is not None and (heading := _heading(sentence)) is not None:
             headings[clock] = heading
-        if sentence.msgID in ("RMC", "ZDA"):
-            now = _moment_ns(sentence) or now
-        if sentence.msgID == "GST" and clock is not None:
+        if clock is not None and sentence.msgID == "GST":
             deviations[clock] = (sentence.stdLong, sentence.stdLat, sentence.stdAlt)
-        elif sentence.msgID in ("GGA", "GNS", "RMC"):
+        if sentence.msgID in ("GGA", "GNS", "RMC"):
             why = _fault(sentence, clock)
             if why and sentence.msgID != "RMC":
-                lost[why] = lost.get(why, 0) + 1
+                lost[why] += 1
             elif not why and clock is not None:
                 stamp = clock if now is None else clock + round((now - clock) / DAY_NS) * DAY_NS
                 one = (stamp, now is not None, *_position(sentence))
                 (flat if sentence.msgID == "RMC" else fixes).append(one)
-    skips = [Skip("fix", shown(path), f"{count} sentences: {why}", count) for why, count in lost.items()]
+    skips = skipped("fix", path, "sentences", lost)
     if flat and not fixes:
         skips.append(without_heights(shown(path), len(flat)))
         fixes, deviations = flat, {}
     if not fixes:
-        raise DataError(
-            f"{shown(path)}: found no GGA, GNS or RMC sentence with a fix"
-            + (f" ({'; '.join(skip.reason for skip in skips)})" if skips else "; expected NMEA 0183")
-        )
+        why = f" ({'; '.join(skip.reason for skip in skips)})" if skips else "; expected NMEA 0183"
+        raise refused(path, f"found no GGA, GNS or RMC sentence with a fix{why}")
     found = _joined(path, fixes, deviations, near_ns, skips)
-    level = np.array([velocities.get(int(stamp % DAY_NS), (np.nan, np.nan)) for stamp in found.stamps_ns])
-    up = np.full(len(level), np.nan)
-    found.more["headings_deg"] = np.array([headings.get(int(s % DAY_NS), np.nan) for s in found.stamps_ns])
-    found.more["velocities"] = np.column_stack([level, up])
+    clocks = (found.stamps_ns % DAY_NS).tolist()
+    found.more["headings_deg"] = np.array([headings.get(ns, np.nan) for ns in clocks])
+    level = [velocities.get(ns, (np.nan, np.nan)) for ns in clocks]
+    found.more["velocities"] = np.array([(*v, np.nan) for v in level])
     return found
 
 
@@ -121,7 +119,7 @@ def _joined(
         stamps = stamps[dated]
     elif not dated.any():
         if near_ns is None:
-            raise DataError(f"{shown(path)}: has no date, expected RMC or ZDA sentences beside GGA")
+            raise refused(path, "has no date, expected RMC or ZDA sentences beside GGA")
         midnights = np.concatenate([[0], np.cumsum(np.diff(stamps) < -DAY_NS // 2)])
         stamps = nearest(stamps + midnights * DAY_NS, DAY_NS, near_ns)
     stamps = _of_this_era(stamps, near_ns if dated.any() else None, path, skips)
@@ -164,12 +162,10 @@ def _best(
 
 def _velocity(sentence: Any) -> tuple[float, float] | None:
     """East and north, m/s, of a sentence with speed and course; None where it tells nothing."""
-    if sentence.msgID == "RMC" and sentence.status == "A":
-        speed, course = sentence.spd, sentence.cog
-    elif sentence.msgID == "VTG":
-        speed, course = sentence.sogn, sentence.cogt
-    else:
-        return None
+    speed, course = {
+        "RMC": lambda: (sentence.spd if sentence.status == "A" else None, sentence.cog),
+        "VTG": lambda: (sentence.sogn, sentence.cogt),
+    }.get(sentence.msgID, lambda: (None, None))()
     if not isinstance(speed, float | int):
         return None
     speed *= MPS_PER_KNOT
@@ -180,12 +176,9 @@ def _velocity(sentence: Any) -> tuple[float, float] | None:
 
 def _heading(sentence: Any) -> float | None:
     """Degrees from true north, of a measurement; None where it tells nothing."""
-    if sentence.msgID == "HDT":
-        said = sentence.headingT
-    elif sentence.msgID == "THS" and sentence.mi == "A":  # others: dead reckoning, by hand, simulated, void
+    said = getattr(sentence, "headingT", None)
+    if sentence.msgID == "THS" and sentence.mi == "A":  # others: dead reckoning, by hand, simulated, void
         said = sentence.headt
-    else:
-        return None
     return float(said) if isinstance(said, float | int) else None
 
 
@@ -206,39 +199,29 @@ def _sentences(lines: list[str]) -> Iterator[Any]:
 def _sentence(body: str, checksum: str) -> Any:
     from pynmeagps import NMEAReader, exceptions
 
+    faults = (exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, ValueError)
     if int(checksum, 16) != reduce(xor, body.encode("utf-8"), 0):
         return "wrong checksum"
     if body[2:5] == "GGA":  # the name of a station behind, which is to be a number, is not of interest
         body = ",".join(body.split(",")[:13]) + ",,"
     try:
         sentence = NMEAReader.parse(f"${body}*{checksum}\r\n", validate=0)
-        return (
-            sentence if all(map(sentence.__dict__.__contains__, USED[sentence.msgID].split())) else "damaged"
-        )
-    except (
-        exceptions.NMEAParseError,
-        exceptions.NMEAMessageError,
-        exceptions.NMEATypeError,
-        ValueError,
-    ):
+    except faults:
         return "damaged"
+    return sentence if {*USED[sentence.msgID].split()} <= sentence.__dict__.keys() else "damaged"
 
 
 def _moment_ns(sentence: Any) -> int | None:
     """Date and time of a sentence, ns since 1970; None where the receiver does not know them yet."""
     if sentence.msgID == "RMC" and sentence.status != "A":
         return None
-    date, clock = sentence.date if sentence.msgID == "RMC" else _date(sentence), _clock_ns(sentence.time)
+    clock, date = _clock_ns(sentence.time), getattr(sentence, "date", None)
+    if sentence.msgID == "ZDA":
+        with suppress(ValueError, TypeError):
+            date = datetime.date(int(sentence.year), int(sentence.month), int(sentence.day))
     if not isinstance(date, datetime.date) or clock is None:
         return None
     return int(np.datetime64(date, "D").astype("datetime64[ns]").astype(np.int64)) + clock
-
-
-def _date(zda: Any) -> datetime.date | None:
-    try:
-        return datetime.date(int(zda.year), int(zda.month), int(zda.day))
-    except (ValueError, TypeError):
-        return None
 
 
 def _clock_ns(time: Any) -> int | None:

@@ -1,15 +1,20 @@
-"""Positions as a file has them, before anything is known of its clock."""
+"""Positions as a file has them, before anything is known of its clock; and what a receiver measured, by their rows."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pyproj import Transformer
 
-from gnss_sem_map.sensor_log import Skip
+from factor_graphs.csv_log import NOT_DEFINITE
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities
+from factor_graphs.receiver_rows import fixes_of, headings_of, velocities_of, with_more
+from gnss_sem_map.sensor_log import Skip, repaired
 
 Array = NDArray[np.float64]
 FLAT_STDDEV_M = 100.0
@@ -34,6 +39,16 @@ class Positions:
     """What else it tells, (n, 3) each, by the names of `receiver_rows.with_more`; NaN where a row does not."""
     above_geoid: NDArray[np.bool_] | None = None
     """(n,) of which the height is above the geoid; of the others it is above the ellipsoid."""
+
+
+def rows_of(
+    found: Positions, zero_ns: int, stamps_ns: NDArray[np.int64], stddevs_m: Sequence[float] | None
+) -> Array:
+    """Rows (n, 18) as `receiver_rows.ROW_COLUMNS`, with seconds from `zero_ns` on, and other deviations if given."""
+    stddevs = found.stddevs if stddevs_m is None else np.tile(stddevs_m, (len(stamps_ns), 1))
+    table = np.column_stack([(stamps_ns - zero_ns) * 1e-9, found.geodetic, stddevs])
+    more = {} if stddevs_m is None else {"correlations": np.full((1, 3), np.nan)}
+    return with_more(table, **found.more | more)
 
 
 def without_heights(where: str, count: int) -> Skip:
@@ -61,3 +76,35 @@ def enu_of_ecef(geodetic: Array) -> Array:
 def thinned(seconds: Array) -> NDArray[np.intp]:
     """The first row of every `STEP_S` of times that rise."""
     return np.flatnonzero(np.diff(np.floor((seconds - seconds[0]) / STEP_S + 1e-6), prepend=-1.0) > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Receiver:
+    """What a receiver measured; nothing where there is none."""
+
+    frame: LocalFrame | None = None
+    gnss: GnssFixes | None = None
+    velocities: GnssVelocities | None = None
+    headings: AntennaHeadings | None = None
+
+
+def measured(
+    rows: NDArray[np.float64],
+    where: str,
+    baseline: ArrayLike | None,
+    velocity: NDArray[np.float64] | None = None,
+    heading: NDArray[np.float64] | None = None,
+) -> tuple[Receiver, list[Skip]]:
+    """What valid rows (n, 18) say, as `receiver_rows.ROW_COLUMNS`, and what was skipped; `baseline` as `headings_of`.
+
+    `velocity` and `heading`: likewise, where these come by topics of their own.
+    Raises MeasurementError.
+    """
+    frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
+    gnss, gnss_repairs, no_covariance = fixes_of(rows, frame)
+    velocities, velocity_repairs = velocities_of(rows if velocity is None else velocity, frame)
+    headings, heading_repairs = headings_of(rows if heading is None else heading, frame, baseline)
+    skips = repaired(where, gnss_repairs, velocity_repairs, heading_repairs)
+    if no_covariance:
+        skips.append(Skip("covariance", where, f"{no_covariance} fixes: {NOT_DEFINITE}", no_covariance))
+    return Receiver(frame, gnss, velocities, headings), skips

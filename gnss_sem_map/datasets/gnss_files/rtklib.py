@@ -19,8 +19,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.datasets.gnss_files.positions import Positions, enu_of_ecef, geodetic_of_ecef
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, GPS_EPOCH_NS, WEEK_NS
 from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.files.untrusted import refused, shown
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -71,7 +70,7 @@ def read(path: Path, lines: list[str]) -> Positions:
     form: Form = _form(columns) if columns else "deg"
     found = [row for row in (_row(line, form) for line in rows) if row is not None]
     if not found:
-        raise DataError(f"{shown(path)}: found no solution among {len(rows)} lines, expected {COLUMNS}")
+        raise refused(path, f"found no solution among {len(rows)} lines, expected {COLUMNS}")
     lost = len(rows) - len(found)
     reason = f"{lost} lines: no solution of a known quality, or no time of a drive"
     skips = [Skip("fix", shown(path), reason, lost)] if lost else []
@@ -180,9 +179,9 @@ def _base(path: Path, header: list[str]) -> LocalFrame:
             if len(words) == 3:
                 place = np.array([[float(word) for word in words]])
                 return LocalFrame(*(geodetic_of_ecef(place) if abs(place[0, 0]) > 90 else place)[0].tolist())
-    raise DataError(
-        f"{shown(path)}: its positions are baselines, and no `ref pos` in its header says from where; add the line"
-        " `% ref pos : LAT LON HEIGHT`, or solve with out-solformat=llh"
+    raise refused(
+        path,
+        "its positions are baselines, no `ref pos` in its header; add it, or out-solformat=llh",
     )
 
 

@@ -21,8 +21,7 @@ from gnss_sem_map.datasets.gnss_files.time_systems import (
     gps_minus_utc_s,
     nearest,
 )
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import read_bytes, shown
+from gnss_sem_map.files.untrusted import read_bytes, refused
 
 Array = NDArray[np.float64]
 
@@ -37,13 +36,9 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     """Positions at 10 Hz; raises DataError for a file that is no SBET, or whose accuracy or week is unknown."""
     seconds, lat, lon, height = _sbet_rows(path)[:, :4].T
     if accuracy is None and not has_stddevs:
-        raise DataError(
-            f"{shown(path)}: an SBET does not tell its accuracy; set `accuracy:` to its smrmsg file, or `stddevs_m:`"
-        )
+        raise refused(path, "an SBET tells no accuracy; set `accuracy:` to its smrmsg file, or `stddevs_m:`")
     if near_ns is None:
-        raise DataError(
-            f"{shown(path)}: an SBET does not tell its week, and no other sensor of this log does"
-        )
+        raise refused(path, "an SBET does not tell its week, and no other sensor of this log does")
     kept = thinned(seconds)
     stamps = _gps_ns(seconds[kept], near_ns)
     stddevs = np.ones((len(kept), 3)) if accuracy is None else _stddevs(accuracy, seconds[kept])
@@ -71,9 +66,7 @@ def read_poses(path: Path, near_ns: int) -> tuple[NDArray[np.int64], Array, Arra
     rows = _sbet_rows(path)
     stamps = _gps_ns(rows[:, 0], near_ns)
     if not (np.abs(rows[:, 7:11]) <= 4 * np.pi).all():
-        raise DataError(
-            f"{shown(path)}: found attitudes that are no radians, expected rows of {COLUMNS} doubles (SBET)"
-        )
+        raise refused(path, f"found attitudes that are no radians, expected rows of {COLUMNS} doubles (SBET)")
     roll, pitch, heading = rows[:, 7], rows[:, 8], rows[:, 9] - rows[:, 10]
     R = Rotation.from_euler("ZYX", np.column_stack([heading, pitch, roll])).as_matrix()
     geodetic = np.column_stack([np.degrees(rows[:, 1]), np.degrees(rows[:, 2]), rows[:, 3]])
@@ -94,18 +87,14 @@ def _sbet_rows(path: Path) -> Array:
     rows = _rows(path, COLUMNS)
     lat, lon, height = rows[:, 1:4].T
     if not ((np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (np.abs(height) < 1e5)).all():
-        raise DataError(
-            f"{shown(path)}: found no latitudes in radians, expected rows of {COLUMNS} doubles (SBET)"
-        )
+        raise refused(path, f"found no latitudes in radians, expected rows of {COLUMNS} doubles (SBET)")
     return rows
 
 
 def _rows(path: Path, columns: int) -> Array:
     content = read_bytes(path)
     if not content or len(content) % (8 * columns):
-        raise DataError(
-            f"{shown(path)}: found {len(content)} bytes, expected rows of {columns} doubles; is it truncated?"
-        )
+        raise refused(path, f"found {len(content)} bytes, expected rows of {columns} doubles; truncated?")
     rows = np.frombuffer(content, "<f8").reshape(-1, columns).copy()
     with np.errstate(invalid="ignore"):
         rows[:, 0] = over_weeks(rows[:, 0])
@@ -114,9 +103,7 @@ def _rows(path: Path, columns: int) -> Array:
             np.isfinite(rows[:, 0]).all() and (rows[:, 0] >= 0).all() and (rows[:, 0] < 2 * WEEK_S).all()
         )
     if not is_clock or not (steps > 0).all():
-        raise DataError(
-            f"{shown(path)}: its first column is no rising time of a week, s; is it an SBET, or smrmsg?"
-        )
+        raise refused(path, "its first column is no rising time of a week, s; is it an SBET, or smrmsg?")
     return rows
 
 
@@ -127,5 +114,5 @@ def _stddevs(path: Path, seconds: Array) -> Array:
         (seconds[0] - rows[:, 0].mean()) / WEEK_S
     )  # one may begin before the week
     if seconds[0] < rows[0, 0] - STEP_S * 20 or seconds[-1] > rows[-1, 0] + STEP_S * 20:
-        raise DataError(f"{shown(path)}: does not cover the time of the SBET; is it of another drive?")
+        raise refused(path, "does not cover the time of the SBET; is it of another drive?")
     return np.column_stack([np.interp(seconds, rows[:, 0], rows[:, column]) for column in (2, 1, 3)])

@@ -17,7 +17,7 @@ from gnss_sem_map.datasets.ros.ros1_file import Ros1File
 from gnss_sem_map.datasets.ros.sqlite_file import SqliteFile
 from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.files.structured import read_yaml
-from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
+from gnss_sem_map.files.untrusted import inside, is_file, is_folder, refused, shown
 
 Ints = NDArray[np.int64]
 BagFile = McapFile | Ros1File | SqliteFile
@@ -66,18 +66,14 @@ class Bag:
         self.path = path
         names = bag_files(path)
         if not names and not os.path.lexists(path):
-            raise DataError(f"{shown(path)}: no such file or folder; expected a bag of ROS 1 or ROS 2")
+            raise refused(path, "no such file or folder; expected a bag of ROS 1 or ROS 2")
         if not names:
-            raise DataError(
-                f"{shown(path)}: found no {', '.join(SUFFIXES)} file, expected a bag of ROS 1 or ROS 2"
-            )
+            raise refused(path, f"found no {', '.join(SUFFIXES)} file, expected a bag of ROS 1 or ROS 2")
         suffixes = sorted({name.suffix.lower() for name in names})
         if len(suffixes) > 1:
-            raise DataError(
-                f"{shown(path)}: found files of {' and '.join(suffixes)} in one folder, expected the parts of one bag"
-            )
+            raise refused(path, f"found files of {' and '.join(suffixes)} in one folder, expected one bag")
         if find_spec("rosbags") is None or find_spec("mcap") is None:
-            raise DataError(f"{shown(path)}: ROS bags need rosbags and mcap; {how_to_install('ros')}")
+            raise refused(path, f"ROS bags need rosbags and mcap; {how_to_install('ros')}")
         about = {} if suffixes == [".bag"] else _metadata(path)
         codec = _message_codec(about)
         self.lost = _lost(about, names)
@@ -89,8 +85,8 @@ class Bag:
     def messages(self, topic: str) -> Messages:
         """The messages of a topic in the order of their arrival; raises DataError when there is no such topic."""
         if topic not in self.kinds:
-            raise DataError(
-                f"{shown(self.path)}: found no topic {topic[:100]!r}; it has {', '.join(sorted(self.kinds))[:500]}"
+            raise refused(
+                self.path, f"no topic {topic[:100]!r}; it has {', '.join(sorted(self.kinds))[:500]}"
             )
         times, places = [], []
         for number, file in enumerate(self._files):
@@ -123,14 +119,12 @@ class Bag:
                 elif encoding not in ENCODINGS:
                     others.add(kind)
                 if self.kinds.setdefault(topic, kind) != kind:
-                    raise DataError(
-                        f"{shown(file.path)}: {topic} is of {kind}, in another part of the bag of {self.kinds[topic]}"
-                    )
+                    raise refused(file.path, f"{topic} is of {kind}, in another part of {self.kinds[topic]}")
         if others and others == set(self.kinds.values()):
-            raise DataError(
-                f"{shown(self.path)}: found no messages of ROS but {', '.join(sorted(others))[:300]}; expected the"
-                " encodings ros1 or cdr; record or convert it with messages of ROS, or write a CSV log"
-                " (docs/your_own_log.md)"
+            raise refused(
+                self.path,
+                f"found no messages of ROS but {', '.join(sorted(others))[:300]}; expected ros1 or"
+                " cdr; record or convert it so, or write a CSV log (docs/your_own_log.md)",
             )
 
 
@@ -143,16 +137,17 @@ def bag_files(path: Path) -> list[Path]:
     found = inside(path)
     packed = [one.name for one in found if one.suffix == WHOLE_FILE and Path(one.stem).suffix in SUFFIXES]
     if packed:
-        raise DataError(
-            f"{shown(path)}: is compressed as whole files ({shown(packed[0])}), which cannot be read in parts; expand"
-            f" it once: zstd -d --rm {shown(packed[0])}, and remove compression_mode from {METADATA}"
+        raise refused(
+            path,
+            f"is compressed as whole files; expand them: zstd -d --rm {shown(packed[0])}, and remove"
+            f" compression_mode from {METADATA}",
         )
     opened = [one.name for one in found if one.suffix == NOT_CLOSED and Path(one.stem).suffix in SUFFIXES]
     if opened:
         name, closed = shown(opened[0]), shown(Path(opened[0]).stem)
-        raise DataError(
-            f"{shown(path)}: holds a part that its recorder did not close ({name}); repair it: rosbag reindex {name};"
-            f" mv {name} {closed}"
+        raise refused(
+            path,
+            f"was not closed ({name}); repair it: rosbag reindex {name}; mv {name} {closed}",
         )
     return [one for one in found if one.suffix.lower() in SUFFIXES and is_file(one)]
 
@@ -197,11 +192,11 @@ def _refuse_others(path: Path, ending: str) -> None:
     """Raise DataError for a file that is empty, or of another kind than its ending says: no tool repairs it."""
     head = OpenFile(path).read_up_to(0, max(map(len, MAGIC.values())))
     if not head:
-        raise DataError(
-            f"{shown(path)}: empty (0 bytes); copy or record it again, or move it to another folder if the other parts"
-            " of the bag suffice"
+        raise refused(
+            path,
+            "empty (0 bytes); copy it again, or move it away if the other parts suffice",
         )
     is_of = next((name for name, magic in MAGIC.items() if head.startswith(magic)), ending)
     if is_of != ending:
         way = f"rename it to {shown(path.stem)}{is_of}" if is_of in SUFFIXES else "unpack it"
-        raise DataError(f"{shown(path)}: found a file of the kind {is_of}, expected {ending}; {way}")
+        raise refused(path, f"found a file of the kind {is_of}, expected {ending}; {way}")

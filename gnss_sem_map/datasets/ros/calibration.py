@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from gnss_sem_map.datasets.ros.bag import Bag
-from gnss_sem_map.datasets.ros.decoding import decode
+from gnss_sem_map.datasets.ros.kinds import decode
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, LidarTopic, Rig, matrix
 from gnss_sem_map.datasets.ros.static_tf import StaticTransforms, read_static_transforms
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.files.untrusted import refused, shown
 from gnss_sem_map.sensor_log import Calibration, Skip
 from gnss_sem_map.sensor_log.cameras import COEFFICIENTS, Camera, Distortion, lidar_to_camera
 
@@ -72,7 +72,7 @@ def _frame_in(bag: Bag, topic: str) -> str:
     """The frame that a topic's first message names."""
     messages = bag.messages(topic)
     if len(messages) == 0:
-        raise DataError(f"{topic}: has no messages, so its frame is unknown; set its `frame:` in rig.yaml")
+        raise refused(topic, "has no messages, so its frame is unknown; set its `frame:` in rig.yaml")
     return str(decode(bag, messages, 0).header.frame_id).strip("/")
 
 
@@ -80,9 +80,10 @@ def _found(bag: Bag, transforms: StaticTransforms, target: str, source: str, nam
     T = np.eye(4) if target == source else transforms.between(target, source)
     if T is None:
         frames = ", ".join(transforms.frames)[:300] or "none"
-        raise DataError(
-            f"{shown(bag.path)}: no fixed transform leads from {source!r} to {target!r} (frames of fixed transforms:"
-            f" {frames}); set {name} in rig.yaml, or `frame:` where a frame has another name"
+        raise refused(
+            bag.path,
+            f"no fixed transform leads from {source!r} to {target!r} (found frames {frames}); set {name},"
+            " or `frame:` where a frame has another name, in rig.yaml",
         )
     return T
 
@@ -114,8 +115,7 @@ def _intrinsics(
     size = camera.image_size or found
     if not K.any() and not P.any():
         raise DataError(
-            f"{camera.info}: its CameraInfo is all zero: the camera was not calibrated; set K and image_size of the"
-            " camera in rig.yaml, or leave it out (cameras: {})"
+            f"{camera.info}: its CameraInfo is all zero: the camera was not calibrated; set K, image_size"
         )
     is_rectified = "rect" in camera.topic.lower() if camera.rectified is None else camera.rectified
     if camera.K is not None:
@@ -162,24 +162,23 @@ def _distortion(info: Any, D: Array, topic: str | None) -> Distortion | None:
         return None
     most = {"brown": 8, "fisheye": 4}.get(model or "", 0)
     if model is None or D[most:].any():
-        raise DataError(
-            f"{topic}: found distortion model {info.distortion_model!r} with {len(D)} coefficients, expected"
+        raise refused(
+            topic,
+            f"found distortion model {info.distortion_model!r} with {len(D)} coefficients, expected"
             " plumb_bob, rational_polynomial (8) or equidistant (4); set K, image_size and distortion of the camera in"
-            " rig.yaml, or `rectified: true` if its images are"
+            " rig.yaml, or `rectified: true` if its images are",
         )
     count = next((count for count in COEFFICIENTS[model] if count >= len(D)), most)
     try:
         padded = [*D[:most].tolist(), *[0.0] * (count - len(D[:most]))]
         return Distortion(model=model, coefficients=tuple(padded))
     except ValidationError as error:
-        raise DataError(f"{topic}: {error.errors()[0]['msg'][:200]}") from None
+        raise refused(topic, f"{error.errors()[0]['msg'][:200]}") from None
 
 
 def _info(bag: Bag, camera: CameraTopic) -> Any:
     if camera.info is None:
-        raise DataError(
-            f"{camera.topic}: no CameraInfo topic beside it; set `info:`, or K and image_size of the camera in rig.yaml"
-        )
+        raise DataError(f"{camera.topic}: no CameraInfo beside it; set info, or K and image_size")
     messages = bag.messages(camera.info)
     if len(messages) == 0:
         raise DataError(f"{camera.info}: has no messages; set K and image_size of the camera in rig.yaml")

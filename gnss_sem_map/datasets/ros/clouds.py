@@ -20,18 +20,19 @@ import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.frames import MOST_POINTS, refuse_other_bytes, scale_intensity
-from gnss_sem_map.datasets.point_times import are_returns, leave_out_of_sweep
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode, header_ns
-from gnss_sem_map.datasets.ros.kinds import LIVOX
-from gnss_sem_map.datasets.stamps import LONGEST_SWEEP_S
+from gnss_sem_map.datasets.ros.kinds import LIVOX, decode
+from gnss_sem_map.datasets.ros.stamps import header_ns
+from gnss_sem_map.datasets.stamps import LONGEST_SWEEP_S, are_returns, leave_out_of_sweep
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.sensor_log import Points
 
 Array = NDArray[np.float64]
@@ -84,10 +85,11 @@ def time_field(names: list[str], said: str | None) -> str | None:
 
 def no_times(where: str, names: list[str]) -> DataError:
     """The error that a cloud does not tell when its points were measured."""
-    return DataError(
-        f"{where}: found fields {', '.join(names)[:200]}, and none with the time of each point; expected one of"
+    return refused(
+        where,
+        f"found fields {', '.join(names)[:200]}, and none with the time of each point; expected one of"
         f" {', '.join(TIME_FIELDS)}; in rig.yaml, `point_times:` is its name, or `{COMPENSATED}` if there is no motion"
-        " in the clouds any more"
+        " in the clouds any more",
     )
 
 
@@ -108,10 +110,11 @@ def times_of(
     told = np.array(list(_middles_and_spans(bag, messages, field))).reshape(-1, 4)
     middle, span, is_whole, _ = np.median(told, axis=0) if len(told) else np.zeros(4)
     if len(told) and not told[:, 1].any():
-        raise DataError(
-            f"{messages.topic}: the field {field!r} is {middle:.9g} in all points of a cloud, expected the time of each"
+        raise refused(
+            messages.topic,
+            f"the field {field!r} is {middle:.9g} in all points of a cloud, expected the time of each"
             f" point; in rig.yaml, `point_times:` names another field, or is `{COMPENSATED}` if there is no motion in"
-            " the clouds any more"
+            " the clouds any more",
         )
     for one in UNITS if unit is None else (unit,):
         after = told[:, 0] * UNITS[one] * 1e-9 - told[:, 3]
@@ -149,6 +152,7 @@ def _middles_and_spans(
 
 
 def read_cloud(
+    _file: Path,
     bag: Bag,
     messages: Messages,
     k: int,
@@ -157,7 +161,7 @@ def read_cloud(
     times: PointTimes,
     intensity_max: float | None = None,
 ) -> Points:
-    """A sweep.
+    """A sweep, in a file of the bag.
 
     `intensity_max` is the number for an intensity of 1; None: 1, and of an unsigned field its largest number.
     `stamp` s of the log, `stamp_ns` the same as Unix ns. Raises DataError for a damaged cloud, and PointTimesError for
@@ -188,22 +192,22 @@ def _table(bag: Bag, messages: Messages, k: int, more: tuple[str, ...]) -> NDArr
     names, offsets = [str(field.name) for field in fields], [int(field.offset) for field in fields]
     formats = [TYPES.get(int(field.datatype)) for field in fields]
     if not {"x", "y", "z", *more} <= set(names) or len(set(names)) < len(names) or None in formats:
-        raise DataError(
-            f"{where}: found fields {', '.join(fields_of(cloud))[:200]}, expected {', '.join(('x', 'y', 'z', *more))},"
-            " each once and of a known type"
+        raise refused(
+            where,
+            f"found fields {', '.join(fields_of(cloud))[:200]}, expected each of {', '.join(('x', 'y', 'z', *more))}",
         )
     order = ">" if cloud.is_bigendian else "<"
     kinds = [np.dtype(f"{order}{kind}") for kind in formats]
     if any(offset + kind.itemsize > step for offset, kind in zip(offsets, kinds, strict=True)):
-        raise DataError(f"{where}: a field lies outside of the {step} bytes of a point")
+        raise refused(where, f"a field lies outside of the {step} bytes of a point")
     height, row, row_step = int(cloud.height), int(cloud.width) * step, int(cloud.row_step)
     data = np.asarray(cloud.data, np.uint8)
     # of one row, and of rows without gaps, some drivers write any row_step
     has_gaps = height > 1 and row_step > row and data.size != n * step
     if not 0 < n <= MOST_POINTS or data.size < (row_step * (height - 1) + row if has_gaps else n * step):
-        raise DataError(
-            f"{where}: found {n} points of {step} bytes in {data.size} bytes (row_step {row_step}), expected 1 to"
-            f" {MOST_POINTS} points"
+        raise refused(
+            where,
+            f"found {n} points of {step} bytes in {data.size} bytes (row_step {row_step})",
         )
     if has_gaps:
         data = np.ndarray((height, row), np.uint8, np.ascontiguousarray(data), 0, (row_step, 1)).ravel()
@@ -229,7 +233,7 @@ def _livox_table(data: bytes, is_ros1: bool, where: str) -> NDArray[Any]:
         *_, n = struct.unpack_from(order + LIVOX_HEAD, data, start)
         start += struct.calcsize(order + LIVOX_HEAD)
     if not 0 < n <= MOST_POINTS or len(data) < start + (n - 1) * step + dtype.itemsize:
-        raise DataError(f"{where}: found {n} points in {len(data)} bytes, expected 1 to {MOST_POINTS} points")
+        raise refused(where, f"found {n} points in {len(data)} bytes, expected 1 to {MOST_POINTS} points")
     return np.ndarray(n, dtype, data, start, step)
 
 

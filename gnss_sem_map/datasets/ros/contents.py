@@ -11,10 +11,10 @@ import yaml
 
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode, header_ns
-from gnss_sem_map.datasets.ros.fix_topics import covariance_of
 from gnss_sem_map.datasets.ros.imu_topics import part_of
-from gnss_sem_map.datasets.ros.kinds import HEADLESS, KINDS, STRING, TAKEN_FOR, unread
+from gnss_sem_map.datasets.ros.kinds import HEADLESS, KINDS, STRING, TAKEN_FOR, decode, unread
+from gnss_sem_map.datasets.ros.receiver_topics import covariance_of
+from gnss_sem_map.datasets.ros.stamps import header_ns
 from gnss_sem_map.datasets.ros.static_tf import URDF, StaticTransforms, read_static_transforms
 from gnss_sem_map.errors import DataError
 

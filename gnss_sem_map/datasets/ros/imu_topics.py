@@ -12,11 +12,11 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import ImuSamples, clean_imu
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.kinds import VECTOR
+from gnss_sem_map.datasets.ros.kinds import VECTOR, decode
 from gnss_sem_map.datasets.ros.rig import ImuTopic
 from gnss_sem_map.datasets.ros.stamps import stamps_of
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def samples_of(
     try:
         samples, repairs = clean_imu(stamps, forces, rates)
     except MeasurementError as error:
-        raise DataError(f"{messages.topic}: {error}") from None
+        raise refused(messages.topic, f"{error}") from None
     if repairs.dropped:
         skips.append(Skip("samples", messages.topic, str(repairs)))
     attitude = None
@@ -117,8 +117,9 @@ def _attitude(message: Any, topic: str) -> AttitudePrior:
     q, variances = message.orientation, np.asarray(message.orientation_covariance)[[0, 4, 8]]
     quaternion = np.array([q.x, q.y, q.z, q.w])
     if not (variances > 0).all() or not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
-        raise DataError(
-            f"{topic}: found orientation {quaternion.tolist()} with variances {variances.tolist()}, expected a unit"
-            " quaternion and variances above 0; set imu.attitude: false in rig.yaml"
+        raise refused(
+            topic,
+            f"found orientation {quaternion.tolist()}, variances {variances.tolist()}, expected length 1"
+            " and above 0; set imu.attitude: false in rig.yaml",
         )
     return AttitudePrior(np.asarray(Rotation.from_quat(quaternion).as_matrix()), np.sqrt(variances))

@@ -15,11 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.datasets.ros.chunks import Chunks
-from gnss_sem_map.datasets.ros.codecs import MOST_BYTES, expand
-from gnss_sem_map.datasets.ros.open_file import OpenFile
-from gnss_sem_map.errors import DataError, one_line
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.datasets.ros.open_file import MOST_BYTES, OpenFile, expand, kept
+from gnss_sem_map.errors import one_line
+from gnss_sem_map.files.untrusted import refused, shown
 
 if TYPE_CHECKING:
     from mcap.records import Channel, McapRecord, Schema
@@ -59,23 +57,25 @@ class McapFile:
             self._starts = np.array([chunk.chunk_start_offset for chunk in chunks], np.int64)
             self._sizes, self._spans = (np.array(rows, np.int64).reshape(-1, 2) for rows in (sizes, spans))
         except (McapError, *DAMAGED) as error:
-            raise DataError(
-                f"{shown(path)}: truncated, damaged or not closed ({one_line(error, 120)}); repair it: mcap recover"
-                f" {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
+            raise refused(
+                path,
+                f"truncated, damaged or not closed ({one_line(error, 120)}); repair it: mcap recover"
+                f" {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder",
             ) from None
         self._codecs = [chunk.compression for chunk in chunks]
         schemas = {one.id: one for one in found if isinstance(one, records.Schema)}
         channels = {one.id: one for one in found if isinstance(one, records.Channel)}
         self.topics = {one.topic: _kind_of(one, schemas.get(one.schema_id)) for one in channels.values()}
-        self._chunks = Chunks(self._expanded)
+        self._chunk_of = kept(self._expanded)
         self._index = self._read_indexes({number: one.topic for number, one in channels.items()})
         indexed = sum(len(times) for times, _ in self._index.values())
         counts = [one.message_count for one in found if isinstance(one, records.Statistics)]
         expected = counts[0] if counts else 1
         if indexed < expected:
-            raise DataError(
-                f"{shown(path)}: not indexed ({indexed} of {expected} messages have a place); write an index: mcap"
-                f" recover {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
+            raise refused(
+                path,
+                f"not indexed ({indexed} of {expected} messages have a place); write an index: mcap"
+                f" recover {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder",
             )
 
     def _summary(self) -> list[McapRecord]:
@@ -104,7 +104,7 @@ class McapFile:
         if self._codecs[chunk] in ("", "none"):
             data = self._plain(chunk, offset, None if self._codec else most)
         else:
-            data = self._within(self._chunks.get(chunk), offset)
+            data = self._within(self._chunk_of(chunk), offset)
         if self._codec:
             return expand(data, self._codec, shown(self.path), most or MOST_BYTES)
         return data if most is None else data[:most]
@@ -144,9 +144,7 @@ class McapFile:
         op, size = RECORD.unpack_from(head) if len(head) >= MESSAGE_HEAD.size else (0, 0)
         size -= MESSAGE_HEAD.size - RECORD.size
         if op != MESSAGE or not 0 <= size <= left - MESSAGE_HEAD.size:
-            raise DataError(
-                f"{shown(self.path)}: damaged; found no message where the index says; mcap recover"
-            )
+            raise refused(self.path, "damaged; found no message where the index says; mcap recover")
         return int(size)
 
     def _expanded(self, chunk: int) -> bytes:
@@ -155,7 +153,7 @@ class McapFile:
         where = f"{shown(self.path)}: chunk {chunk}"
         content = expand(self._file.read(start, compressed), self._codecs[chunk], where)
         if len(content) != plain:
-            raise DataError(f"{where}: damaged; found {len(content)} bytes, expected {plain}")
+            raise refused(where, f"damaged; found {len(content)} bytes, expected {plain}")
         return content
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.kinds import COMPRESSED_IMAGE
-from gnss_sem_map.errors import DataError, ImageSizeError
+from gnss_sem_map.datasets.ros.kinds import COMPRESSED_IMAGE, decode
+from gnss_sem_map.errors import ImageSizeError
 from gnss_sem_map.files.pictures import JPEG, MOST_PIXELS, PNG, decoded_picture
+from gnss_sem_map.files.untrusted import refused
 
 ENCODINGS: dict[str, tuple[int, int, str]] = {
     **{
@@ -34,13 +35,15 @@ Of NV12 and NV21, rows of colours stand below those of the grey picture, half as
 """
 
 
-def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None) -> NDArray[np.uint8]:
-    """RGB pixels (h, w, 3); raises DataError for a damaged image, another encoding, or another (width, height)."""
+def read_image(
+    _file: Path, bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None
+) -> NDArray[np.uint8]:
+    """RGB pixels (h, w, 3) of a message; raises DataError for a damaged one, another encoding or (width, height)."""
     message, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
     if why := unread_encoding(message):
-        raise DataError(
-            f"{where}: found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; record them so, or"
-            " convert them once (image_transport republish)"
+        raise refused(
+            where,
+            f"found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; convert it",
         )
     if messages.kind == COMPRESSED_IMAGE:
         picture = decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)
@@ -74,8 +77,9 @@ def _raw(message: Any, where: str, size: tuple[int, int] | None) -> NDArray[np.u
     height += height // 2 if "NV" in code else 0
     row, data = width * depth * of_number, np.asarray(message.data, np.uint8)
     if not 0 < width * height <= MOST_PIXELS or step < row or data.size < step * height:
-        raise DataError(
-            f"{where}: damaged image; found {data.size} bytes for {width} x {height} pixels in rows of {step} bytes"
+        raise refused(
+            where,
+            f"damaged; {data.size} bytes for {width} x {height} pixels in rows of {step}",
         )
     rows = data[: step * height].reshape(height, step)[:, :row]
     if of_number == 2:
@@ -94,4 +98,4 @@ def _as_rgb(pixels: NDArray[np.uint8], code: str, where: str) -> NDArray[np.uint
         return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{code}")), np.uint8)
     except cv2.error:
         height, width = pixels.shape[:2]
-        raise DataError(f"{where}: {width} x {height} pixels are too few or odd for {code}") from None
+        raise refused(where, f"{width} x {height} pixels are too few or odd for {code}") from None

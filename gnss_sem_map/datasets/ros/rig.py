@@ -7,23 +7,30 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.settings import SampleInstant
 from gnss_sem_map.datasets.gnss_files import GnssFile
 from gnss_sem_map.datasets.ros.clouds import Unit
 from gnss_sem_map.datasets.ros.stamps import Clock
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import fault_of, read_yaml
-from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.files.untrusted import is_file, refused
 from gnss_sem_map.sensor_log.cameras import Distortion, is_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 NAME = "rig.yaml"
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
-Pose = Annotated[list[Row], Field(min_length=4, max_length=4)]
+
+
+def _rigid(pose: list[Row]) -> list[Row]:
+    if not is_rigid(np.array(pose, np.float64)):
+        raise ValueError("found no rigid transform, expected 4 x 4, rotation orthonormal to 1e-3")
+    return pose
+
+
+Pose = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -31,10 +38,13 @@ class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class _Topic(_Section):
+class _Stamped(_Section):
     topic: str = Field(description="Name of the topic.")
-    frame: str | None = Field(None, description="Frame of the sensor; default: the frame_id in its messages.")
     stamps: Clock = Field("header", description="When a message was measured: its header, or its arrival.")
+
+
+class _Topic(_Stamped):
+    frame: str | None = Field(None, description="Frame of the sensor; default: the frame_id in its messages.")
 
 
 class ImuTopic(_Topic):
@@ -53,30 +63,23 @@ class ImuTopic(_Topic):
     )
 
 
-class VelocityTopic(_Section):
+class VelocityTopic(_Stamped):
     """Velocity of the antenna: a topic of TwistStamped or TwistWithCovarianceStamped."""
 
-    topic: str = Field(description="Name of the topic.")
     axes: Literal["enu", "ned"] = Field("enu", description="East, north, up, or north, east, down.")
-    stamps: Clock = Field("header", description="When it was measured: its header, or its arrival.")
 
 
-class HeadingTopic(_Section):
+class HeadingTopic(_Stamped):
     """Heading between two antennas: a topic of Imu (its orientation), QuaternionStamped or Float64 (degrees)."""
 
-    topic: str = Field(description="Name of the topic.")
     axes: Literal["enu", "ned"] | None = Field(
         None,
         description="enu: counter-clockwise from east, ned: clockwise from north; default: enu of Imu, else ned.",
     )
-    stamps: Clock = Field("header", description="When it was measured: its header, or its arrival.")
 
 
-class WheelTopic(_Section):
+class WheelTopic(_Stamped):
     """Speed of the vehicle along x: a topic of Odometry, a twist, an Autoware report or a float; `speed_unit`."""
-
-    topic: str = Field(description="Name of the topic.")
-    stamps: Clock = Field("header", description="When it was measured: its header, or its arrival.")
 
 
 class GnssTopic(_Section):
@@ -120,8 +123,6 @@ class LidarTopic(_Topic):
         description="Number for an intensity of 1; default: 1, and of an unsigned field its largest number.",
     )
 
-    _rigid = field_validator("T_imu_lidar")(lambda value: _checked(value))
-
 
 class CameraTopic(_Topic):
     """A camera."""
@@ -143,8 +144,6 @@ class CameraTopic(_Topic):
     T_imu_camera: Pose | None = Field(None, description="Camera to IMU, in place of T_camera_lidar.")
     time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
 
-    _rigid = field_validator("T_camera_lidar", "T_imu_camera")(lambda value: _checked(value))
-
 
 class Rig(SensorConventions):
     """Content of rig.yaml; axes, units and clocks are those of `SensorConventions`."""
@@ -164,7 +163,7 @@ def rig_file(bag: Path) -> Path | None:
     places += [bag.absolute().parent / NAME, bag.resolve().parent / NAME]
     others = [place.with_suffix(".yml") for place in places if is_file(place.with_suffix(".yml"))]
     if others and not any(map(is_file, places)):
-        raise DataError(f"{shown(others[0])}: is not read; rename it to {NAME}")
+        raise refused(others[0], f"is not read; rename it to {NAME}")
     return next((place for place in places if is_file(place)), None)
 
 
@@ -173,15 +172,9 @@ def read_rig(path: Path) -> Rig:
     try:
         return Rig.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        raise DataError(f"{shown(path)}: {fault_of(error)}; see docs/your_own_log.md") from None
+        raise refused(path, f"{fault_of(error)}; see docs/your_own_log.md") from None
 
 
 def matrix(pose: Pose | None) -> NDArray[np.float64] | None:
     """A pose of rig.yaml (4, 4)."""
     return None if pose is None else np.array(pose, np.float64)
-
-
-def _checked(pose: Pose | None) -> Pose | None:
-    if pose is not None and not is_rigid(np.array(pose, np.float64)):
-        raise ValueError("found no rigid transform, expected 4 x 4, rotation orthonormal to 1e-3")
-    return pose

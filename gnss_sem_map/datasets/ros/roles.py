@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from gnss_sem_map.datasets.ros.bag import Bag
-from gnss_sem_map.datasets.ros.decoding import decode
 from gnss_sem_map.datasets.ros.imu_topics import part_of
-from gnss_sem_map.datasets.ros.kinds import INFO, KINDS, NAMED, unread
+from gnss_sem_map.datasets.ros.kinds import INFO, KINDS, NAMED, decode, unread
 from gnss_sem_map.datasets.ros.pictures import unread_encoding
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, ImuTopic, LidarTopic, Rig
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.files.untrusted import refused, shown
 from gnss_sem_map.sensor_log import SENSOR, Skip
 
 
@@ -106,9 +105,10 @@ def nothing_read(bag: Bag) -> DataError:
     """The error that no topic of a bag is of a sensor, with what may be done about its types."""
     notes = "; ".join(f"{topic}: {note}" for topic, note in _notes(bag))
     found = ", ".join(sorted(set(bag.kinds.values())))[:300] or "no topics"
-    return DataError(
-        f"{shown(bag.path)}: nothing of it is read; found no topic of an IMU, a receiver, a LiDAR or a camera, but"
-        f" {found}; {notes[:300] or 'docs/your_own_log.md lists the types that are read'}"
+    return refused(
+        bag.path,
+        f"nothing of it is read; found no topic of an IMU, a receiver, a LiDAR or a camera, but"
+        f" {found}; {notes[:300] or 'docs/your_own_log.md lists the types that are read'}",
     )
 
 
@@ -128,9 +128,10 @@ def _imu(bag: Bag, topics: list[str]) -> ImuTopic | None:
 def _only(bag: Bag, sensor: str, key: str, among: list[str] | None = None) -> str | None:
     found = of_kind(bag, sensor) if among is None else among
     if len(found) > 1:
-        raise DataError(
-            f"{shown(bag.path)}: found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in"
-            f" rig.yaml, {key}; `gnss-sem-map inspect` writes one to edit"
+        raise refused(
+            bag.path,
+            f"found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in rig.yaml, {key}"
+            " (`gnss-sem-map inspect`)",
         )
     return found[0] if found else None
 
@@ -152,8 +153,7 @@ def _check(bag: Bag, rig: Rig) -> None:
             _check_kind(bag, place, topic, (*KINDS[sensor], *NAMED.get(sensor, ())))
             if places.setdefault(topic, place) != place:
                 raise DataError(
-                    f"rig.yaml: {place}: {topic} is {places[topic]} already, and would count twice; correct or remove"
-                    " one of them"
+                    f"rig.yaml: {place}: {topic} is {places[topic]} already, and would count twice"
                 )
     for name, camera in rig.cameras.items():
         if camera.info is not None:

@@ -11,11 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.datasets.ros.chunks import Chunks
-from gnss_sem_map.datasets.ros.codecs import expand
-from gnss_sem_map.datasets.ros.open_file import OpenFile
-from gnss_sem_map.errors import DataError, one_line
-from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.datasets.ros.open_file import OpenFile, expand, kept
+from gnss_sem_map.errors import one_line
+from gnss_sem_map.files.untrusted import refused, shown
 
 Ints = NDArray[np.int64]
 
@@ -38,9 +36,10 @@ class Ros1File:
         try:
             reader.open()
         except (ReaderError, struct.error, AssertionError, IndexError, ValueError, OSError) as error:
-            raise DataError(
-                f"{shown(path)}: truncated, damaged or not indexed ({one_line(error, 120)}); repair it: rosbag reindex"
-                f" {shown(path.name)}, and move the copy that it leaves (.orig.bag) to another folder"
+            raise refused(
+                path,
+                f"truncated, damaged or not indexed ({one_line(error, 120)}); repair it: rosbag reindex"
+                f" {shown(path.name)}, and move the copy that it leaves (.orig.bag) to another folder",
             ) from None
         try:
             self.topics = {one.topic: (one.msgtype, "ros1") for one in reader.connections}
@@ -60,7 +59,7 @@ class Ros1File:
         finally:
             reader.close()
         self._index = {topic: np.concatenate(rows) for topic, rows in parts.items()}
-        self._chunks = Chunks(self._expanded)
+        self._chunk_of = kept(self._expanded)
 
     def index(self, topic: str) -> tuple[Ints, Ints]:
         """Arrival (n,), ns, and place (n, 2) of the messages of a topic, in the order of the file."""
@@ -71,7 +70,7 @@ class Ros1File:
         """The message at a place, or its first bytes."""
         chunk, offset = place
         if self._codecs[chunk] != "none":
-            content = self._chunks.get(chunk)
+            content = self._chunk_of(chunk)
             start, size = self._extent(content[offset : offset + MOST_HEADER_BYTES], len(content) - offset)
             return content[offset + start : offset + start + (size if most is None else min(most, size))]
         at, left = int(self._chunk[chunk, 0]) + offset, int(self._chunk[chunk, 1]) - offset
@@ -90,9 +89,7 @@ class Ros1File:
         start = 2 * SIZE.size + fields
         size = SIZE.unpack_from(head, SIZE.size + fields)[0] if start <= len(head) else left
         if MESSAGE_FIELD not in head[: SIZE.size + fields] or start + size > left:
-            raise DataError(
-                f"{shown(self.path)}: damaged; found no message where the index says; rosbag reindex"
-            )
+            raise refused(self.path, "damaged; found no message where the index says; rosbag reindex")
         return start, size
 
     def _expanded(self, chunk: int) -> bytes:

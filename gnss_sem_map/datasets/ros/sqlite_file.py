@@ -10,9 +10,9 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.datasets.ros.codecs import MOST_BYTES, expand
+from gnss_sem_map.datasets.ros.open_file import MOST_BYTES, expand
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_file, shown, status
+from gnss_sem_map.files.untrusted import is_file, refused, shown, status
 
 Ints = NDArray[np.int64]
 DAMAGED = (sqlite3.Error, TypeError, ValueError, OverflowError)
@@ -60,9 +60,10 @@ class SqliteFile:
         return expand(data, self._codec, shown(self.path), most or MOST_BYTES) if self._codec else data
 
     def _damaged(self, error: Exception) -> DataError:
-        return DataError(
-            f"{shown(self.path)}: truncated, damaged or no bag ({error}); repair it: sqlite3 {shown(self.path.name)}"
-            f" .recover | sqlite3 repaired.db3, and move {shown(self.path.name)} to another folder"
+        return refused(
+            self.path,
+            f"truncated, damaged or no bag ({error}); repair it: sqlite3 {shown(self.path.name)}"
+            f" .recover | sqlite3 repaired.db3, and move {shown(self.path.name)} to another folder",
         )
 
 
@@ -72,7 +73,8 @@ def _refuse_log(path: Path) -> None:
     found = status(log)
     if found is not None and found.st_size:
         name = shown(path.name)
-        raise DataError(
-            f"{shown(log)}: found {found.st_size} bytes of messages that are not in {name} yet, expected a bag that was"
-            f' closed; end the recorder, then run: sqlite3 {name} "PRAGMA wal_checkpoint(TRUNCATE)"'
+        raise refused(
+            log,
+            f"found {found.st_size} bytes of messages that are not in {name} yet, expected a bag that was"
+            f' closed; end the recorder, then run: sqlite3 {name} "PRAGMA wal_checkpoint(TRUNCATE)"',
         )

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
-from gnss_sem_map.datasets.ros.decoding import header_ns
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.datasets.ros.kinds import HEADLESS
+from gnss_sem_map.files.untrusted import refused
 from gnss_sem_map.sensor_log import Skip
 
 Ints = NDArray[np.int64]
 Clock = Literal["header", "received"]
 
+HEAD_BYTES = 16
+"""From the start of a message to the end of its header's stamp."""
 JUMP_NS = 1_000_000_000
 """From one message to the next, stamps and arrivals differ by less, in a bag that is played slowly as well."""
 MOST_WRONG = 0.1
@@ -37,9 +40,9 @@ def stamps_of(bag: Bag, messages: Messages, clock: Clock) -> tuple[Ints, NDArray
     told = " and ".join(f"{count} of {len(said)} header stamps {why}" for count, why in wrong if count)
     told = told.replace("stamps zero", "stamps are zero")
     if int((~believed).sum()) > MOST_WRONG * len(said):
-        raise DataError(
-            f"{messages.topic}: {told}, expected the times of measuring; set `stamps: received` for this topic in"
-            " rig.yaml to take the times of arrival"
+        raise refused(
+            messages.topic,
+            f"{told}; set `stamps: received` for this topic in rig.yaml",
         )
     return said, believed, [Skip("stamp", messages.topic, told, int((~believed).sum()))] if told else []
 
@@ -68,3 +71,19 @@ def _of_the_longest_run(said: Ints, received: Ints) -> NDArray[np.bool_]:
             if abs(int(there[number]) - int(edge)) <= JUMP_NS:
                 belongs[number], edge = True, here[number]
     return np.asarray(belongs[run])
+
+
+def header_ns(bag: Bag, messages: Messages, k: int) -> int:
+    """The stamp in the header of a message, Unix ns, or its arrival where the type has none; raises DataError."""
+    if messages.kind in HEADLESS:
+        return int(messages.received_ns[k])
+    head = bag.read(messages, k, HEAD_BYTES)
+    try:
+        if messages.is_ros1:
+            _, seconds, nanoseconds = struct.unpack_from("<III", head)
+        else:
+            order = "<" if head[1] & 1 else ">"
+            seconds, nanoseconds = struct.unpack_from(f"{order}iI", head, 4)
+    except (struct.error, IndexError):
+        raise refused(messages.topic, f"message {k} has {len(head)} bytes, no header") from None
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.datasets.ros.bag import Bag
-from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.kinds import STRING, TRANSFORMS
+from gnss_sem_map.datasets.ros.kinds import STRING, TRANSFORMS, decode
 from gnss_sem_map.errors import DataError
 
 Array = NDArray[np.float64]
@@ -52,7 +51,7 @@ class StaticTransforms:
         found = _between(self._all, target, source) if found is None else found
         if found is None and self._wrong:
             raise DataError(
-                f"{'; '.join(self._wrong.values())[:400]}; give the poses (T_imu_lidar, T_camera_lidar) in rig.yaml"
+                f"{'; '.join(self._wrong.values())[:400]}; give T_imu_lidar and the like in rig.yaml"
             )
         return found
 
@@ -77,8 +76,7 @@ def _ancestors(edges: Edges, frame: str) -> dict[str, Array]:
         at, edge = edges[at]
         if at in found:
             raise DataError(
-                f"fixed transforms: found a circle of frames, {' > '.join([*found, at])}; expected a tree; give the"
-                " poses (T_imu_lidar, T_camera_lidar) in rig.yaml"
+                f"fixed transforms: a circle of frames, {' > '.join([*found, at])}; give the poses in rig.yaml"
             )
         T = edge if T is None else edge @ T  # no product with the identity: the edge to the bit
         found[at] = T

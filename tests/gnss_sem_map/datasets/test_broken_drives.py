@@ -37,7 +37,7 @@ def rewrite(name: str, old: str, new: str) -> Callable[[Path], None]:
         (rewrite("../calib_cam_to_cam.txt", "P_rect_02", "P_rect_07"), "row 'P_rect_02': found nothing"),
         (rewrite("../calib_velo_to_cam.txt", "R: ", "R: 1 "), "row 'R': found 10 numbers, expected 9"),
         (rewrite("../calib_imu_to_velo.txt", "R: 1.0", "R: 3.0"), "R: found a matrix of determinant 3"),
-        (remove("oxts/timestamps.txt"), "oxts/timestamps.txt: missing stamps"),
+        (remove("oxts/timestamps.txt"), "oxts/timestamps.txt: missing; expected stamps"),
         (rewrite("oxts/timestamps.txt", "2011-09-26", "26.9.2011"), "line 1: found '26.9.2011"),
     ],
 )

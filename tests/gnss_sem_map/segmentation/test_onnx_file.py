@@ -257,9 +257,9 @@ def test_a_network_that_needs_whole_strides_gets_them(tmp_path: Path, shape: tup
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("two inputs", "expected one of float"),
-        ("four channels", r"expected one of float \(1, 3, height, width\)"),
-        ("no image", r"found outputs .*'mean'.*, expected float \(1, classes, height, width\)"),
+        ("two inputs", "expected one: float"),
+        ("four channels", r"expected one: float \(1, 3, h, w\)"),
+        ("no image", r"found outputs .*'mean'.*, expected float \(1, classes, h, w\)"),
     ],
 )
 def test_another_layout_is_refused_on_opening(tmp_path: Path, kind: str, message: str) -> None:

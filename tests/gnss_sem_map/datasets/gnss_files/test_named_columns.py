@@ -175,7 +175,7 @@ def test_a_table_of_positions_by_its_names(tmp_path: Path, name: str, ending: st
 def test_a_table_without_deviations_or_above_a_geoid_says_the_setting(tmp_path: Path) -> None:
     path = tmp_path / "export.txt"
     path.write_text(table("week,gpstime,lat,lon,H-MSL", lambda k: [WEEK, SOW[k], *PLACES[k]]))
-    with pytest.raises(DataError, match=r"does not tell its accuracy; set `stddevs_m: \[east, north, up\]`"):
+    with pytest.raises(DataError, match=r"tells no accuracy; set `stddevs_m: \[east, north, up\]`"):
         read(path)
     with pytest.raises(DataError, match=r"heights are above the geoid.*set `geoid:`"):
         read(path, stddevs_m=(0.1, 0.1, 0.2))

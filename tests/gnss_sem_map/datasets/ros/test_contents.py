@@ -75,7 +75,7 @@ def test_a_camera_without_calibration_is_noted_as_it_stops_a_run(tmp_path: Path)
     path = ros.write(tmp_path / "drive", rig)
     notes = topics_of(path)["/image_rect"].notes
     assert notes[0] == "no CameraInfo topic beside it: set info, or K and image_size"
-    with pytest.raises(DataError, match=r"/image_rect: no CameraInfo topic beside it; set `info:`, or K"):
+    with pytest.raises(DataError, match=r"/image_rect: no CameraInfo beside it; set info, or K"):
         open_drive(path)
 
 

@@ -178,7 +178,7 @@ def test_two_fields_of_one_name_that_is_read_are_refused(tmp_path: Path) -> None
     cloud = rig.messages[-1][2]
     cloud.fields.append(cloud.fields[0])
     with pytest.raises(
-        DataError, match=r"/points: message 0: found fields x, y, z, intensity, time, x, expected x"
+        DataError, match=r"/points: message 0: found fields x, y, z, intensity, time, x, expected each of x"
     ):
         opened(tmp_path, rig).scans[0].read()
 
@@ -241,7 +241,7 @@ def foreign(rig: ros.Rig, kind: str, topic: str) -> list[ros.Message]:
     """Messages of a type that is not known here: the real ones begin with a header, too."""
     from rosbags.typesys import get_types_from_msg
 
-    from gnss_sem_map.datasets.ros.decoding import typestore
+    from gnss_sem_map.datasets.ros.kinds import typestore
 
     store = typestore(rig.is_ros1)
     if kind not in store.fielddefs:

@@ -167,12 +167,12 @@ def test_missing_and_circular_transforms(tmp_path: Path) -> None:
     bag = ros.write(tmp_path / "none", ros.drive(frames=False))
     with pytest.raises(
         DataError,
-        match=r"no fixed transform leads from 'lidar' to 'imu' \(frames of fixed transforms: none\)",
+        match=r"no fixed transform leads from 'lidar' to 'imu' \(found frames none\)",
     ):
         open_drive(bag)
     rig = ros.drive(frames=False)
     rig.transforms(("imu", "base", (0, 0, 0)), ("base", "lidar", (0, 0, 0)), ("lidar", "imu", (0, 0, 0)))
-    with pytest.raises(DataError, match=r"a circle of frames, .*; expected a tree"):
+    with pytest.raises(DataError, match=r"a circle of frames, .*; give the poses in rig.yaml"):
         open_drive(ros.write(tmp_path / "circle", rig))
 
 

@@ -1,14 +1,15 @@
-"""The map of several drives: their folders are linked into it, their maps are added, the sum is refined and exported.
+"""The map of all drives: theirs are linked into it and added, the sum is refined and exported.
 
 OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive; its point labels, by the map of all
-OUT/map, ...        their sum, refined and exported as the map of one drive is
+OUT/map, ...        their sum, refined and exported
+OUT/                of a map of one drive, both
 """
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +24,24 @@ from gnss_sem_map.files import ownership
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_folder
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.checkpoints import objects_from_json
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
+from gnss_sem_map.mapping.refining import Refined
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import pipeline
-from gnss_sem_map.runs.about import about_map
-from gnss_sem_map.runs.bound_drives import BoundDrives
+from gnss_sem_map.runs.about import about_map, seconds_of
+from gnss_sem_map.runs.binding import BoundDrives
+from gnss_sem_map.runs.drive_job import DriveJob
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_folder import write_about, write_map_files
 from gnss_sem_map.runs.run_settings import COPIES, SETTINGS
 from gnss_sem_map.runs.session_changes import changes_in
-from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
@@ -48,45 +53,88 @@ OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
 def write_drives(
     out: Path,
     drives: Mapping[str, Path],
-    failed: Mapping[str, str],
     bound: BoundDrives,
-    run: SeveralDrives,
+    run: MapJob,
     labelled: Sequence[Source] = (),
     align_to: Path | None = None,
 ) -> dict[str, Any]:
-    """Write the map of `drives`, name -> folder, into `out`, and the point labels of those that are `labelled`.
+    """Write the map of several `drives`, name -> folder, into `out`, and the point labels of the `labelled`.
 
-    Returns the content of run.json, with the drives that `failed`.
+    Returns the content of run.json, with the drives that failed.
     """
     settings, stats, label_set = run.settings, RunStats(), open_label_set(run.settings.classes)
-    executor, work = run.executor, run.work
+    assert run.frame is not None
     with new_folder(out) as folder:
         parts = [folder / DRIVES / name for name in sorted(drives)]
         for part in parts:
-            _link_all(drives[part.name], part)
+            _link_map(drives[part.name], part)
+            for name in OF_ONE_DRIVE:
+                link_or_copy(drives[part.name] / name, part / name)
         with stats.stage("mapping"):
-            write_sum(parts, folder, run.frame, settings.classes, out, executor=executor, work=work)
+            write_sum(parts, folder, run.frame, settings.classes, out, executor=run.executor, work=run.work)
         # tiles that are taken from an earlier map do not say which points of kerbs are which
-        earlier = None if labelled else out
-        refined = pipeline.refine(
-            folder, settings, stats, run.progress, earlier, executor=executor, work=work
-        )
-        if labelled:
-            of_drives = (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled)
-            with stats.stage("labels"):
-                write_point_labels(folder, of_drives, refined.kerbs, settings, run.progress)
+        refined = _refined(folder, run, stats, None if labelled else out)
+        of_drives = (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled)
+        with stats.stage("labels"):
+            write_point_labels(folder, of_drives, refined.kerbs, settings, run.progress)
         with stats.stage("changes"):
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
             write_changes(changes, Georeference.of(run.frame, settings.delivery), label_set, folder)
         join_movers(parts, folder)
-        about = _about_drives(parts, failed, bound, align_to) | {
+        about = _about_drives(parts, run.failed, bound, align_to) | {
             "local_frame": asdict(run.frame),
             "changes": [change.about(label_set) for change in changes or ()],
             "map": about_map(folder, refined.report),
         }
         about["warnings"] += stats.warnings
         return write_summary(folder, settings, about, run.progress)
+
+
+def write_one(out: Path, job: DriveJob, run: MapJob, write_labels: bool) -> dict[str, Any]:
+    """Write the map of one drive into `out`, with point labels if they are wanted; returns the content of run.json."""
+    settings, stats = run.settings, RunStats()
+    with new_folder(out) as folder:
+        _link_map(job.made, folder)
+        refined = _refined(folder, run, stats)
+        tracked = job.needed("finished").about
+        report = replace(
+            refined.report,
+            tracked=objects_from_json(tracked["objects"]),
+            untracked=tracked["untracked"],
+        )
+        track = Trajectory(**job.needed("placed").of("track"))  # not rounded, as that in files
+        if write_labels:
+            with stats.stage("labels"):
+                drives = [replace(_labelled(job.source, folder, settings), trajectory=track)]
+                write_point_labels(folder, drives, refined.kerbs, settings, run.progress)
+        about = read_run(job.made)
+        tracks = [track.during(*about["scans_s"])]
+        with stats.stage("export"):
+            write_map_files(folder, tracks, str(about["name"]), settings.delivery, progress=run.progress)
+        return write_about(
+            folder, settings, _about_one(about, stats) | {"map": about_map(folder, report)},
+            read_json(job.made / "metrics.json"),
+        )  # fmt: skip
+
+
+def _refined(folder: Path, run: MapJob, stats: RunStats, earlier: Path | None = None) -> Refined:
+    return pipeline.refine(
+        folder, run.settings, stats, run.progress, earlier, executor=run.executor, work=run.work
+    )
+
+
+def _about_one(about: dict[str, Any], stats: RunStats) -> dict[str, Any]:
+    """What run.json says of a drive and of the map of it alone."""
+    doubt, seconds = (about["delivery"] or {}).get("doubt"), seconds_of(stats)
+    seconds["export"] = round(seconds["export"] + about["seconds"].get("export", 0.0), 3)
+    warnings = [said for said in about["warnings"] if said != doubt]
+    peaks = {name: round(peak) for name, peak in stats.peak_memory_mb.items()}
+    return {name: value for name, value in about.items() if name not in ("correction", "delivery")} | {
+        "seconds": about["seconds"] | seconds,
+        "peak_memory_mb": about["peak_memory_mb"] | peaks,
+        "warnings": [*warnings, *stats.warnings],
+    }
 
 
 def write_summary(
@@ -102,17 +150,13 @@ def _about_drives(
     parts: Sequence[Path], failed: Mapping[str, str], bound: BoundDrives, align_to: Path | None
 ) -> dict[str, Any]:
     """What run.json says of the drives of a map, which are in these folders, and of what binds them."""
-    unbound = sorted(bound.failed.keys() & {part.name for part in parts})
     return {
         "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
         "merged": [part.name for part in parts],
         "drives": {part.name: _summary(part) for part in parts},
         "failed": dict(sorted(failed.items())),
         "aligned_to": None if align_to is None else str(align_to.resolve()),
-        "warnings": [
-            *bound.warnings,
-            *(f"{name}: could not be bound to other drives ({bound.failed[name]})" for name in unbound),
-        ],
+        "warnings": list(bound.warnings),
         "passes": [
             *(asdict(row) for row in bound.passes),
             *(row for part in parts for row in read_run(part).get("passes", ())),
@@ -137,18 +181,14 @@ def _summary(drive: Path) -> dict[str, Any]:
     }
 
 
-def _link_all(drive: Path, part: Path) -> None:
-    """Link what belongs to one drive, out of its own folder or out of a run of this drive alone."""
-    part.mkdir(parents=True)
+def _link_map(drive: Path, part: Path) -> None:
+    """Link the map and the trajectory of one drive, out of its own folder or out of a run of this drive alone."""
+    part.mkdir(parents=True, exist_ok=True)
     for name in (MAP, ATTRIBUTES, evidence.FOLDER):
         if not is_folder(drive / name):
             continue  # older versions knew no attributes
         ignore = shutil.ignore_patterns(ownership.MARKER)
         shutil.copytree(drive / name, part / name, copy_function=link_or_copy, ignore=ignore)
-    for file in (
-        *drive.glob("trajectory*"),
-        *drive.glob("objects.*"),
-        *(file for name in COPIES for file in drive.glob(name)),
-        *(drive / name for name in OF_ONE_DRIVE),
-    ):
+    copies = [file for name in COPIES for file in drive.glob(name)]
+    for file in (*drive.glob("trajectory*"), *drive.glob("objects.*"), *copies):
         link_or_copy(file, part / file.name)

@@ -6,8 +6,8 @@ or was made from something else, is not there.
 
 from __future__ import annotations
 
-import io
 import json
+import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.atomic import unfinished
-from gnss_sem_map.files.untrusted import is_file, read_bytes
+from gnss_sem_map.files.untrusted import is_file, open_file
 from gnss_sem_map.files.work_folder import writing_to
 
 if TYPE_CHECKING:
@@ -55,14 +55,13 @@ def remember(
     path: Path, made_from: str, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
     """Save what was made from inputs with this digest; raises DataError when it cannot be written."""
-    file = io.BytesIO()
     said = {MADE_FROM: np.array(made_from), ABOUT: np.frombuffer(json.dumps(about).encode(), np.uint8)}
-    np.savez(file, allow_pickle=False, **said, **arrays)
     with writing_to(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         # no fsync: what a crash of the machine cuts short is found by its checksums, and made again
         beside = unfinished(path)
-        beside.write_bytes(file.getvalue())
+        with beside.open("wb") as file:
+            np.savez(file, allow_pickle=False, **said, **arrays)
         beside.replace(path)
 
 
@@ -71,10 +70,10 @@ def recall(path: Path, made_from: str | None) -> Found | None:
     if not is_file(path):
         return None
     try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as archive:
+        with os.fdopen(open_file(path), "rb") as file, np.load(file, allow_pickle=False) as archive:
             if made_from not in (None, str(archive[MADE_FROM])):
                 return None
             arrays = {name: archive[name] for name in archive.files if name not in (MADE_FROM, ABOUT)}
             return Found(json.loads(archive[ABOUT].tobytes()), arrays)
-    except (DataError, KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
+    except (DataError, KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
         return None

@@ -136,8 +136,13 @@ def remove_damaged_drives(folder: Path) -> None:
 def remove_matches(folder: Path) -> None:
     """Remove saved LiDAR odometry, its sweeps, and what was registered along it; raises OSError."""
     _remove_known(folder, folder / MATCHES)
-    _remove_known(folder, folder / SWEEPS)
     _remove_known(folder, folder / REVISITS)
+    remove_sweeps(folder)
+
+
+def remove_sweeps(folder: Path) -> None:
+    """Remove saved sweeps; raises OSError."""
+    _remove_known(folder, folder / SWEEPS)
 
 
 def remove_answers(folder: Path) -> None:

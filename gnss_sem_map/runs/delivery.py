@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.movers import join_movers
 from gnss_sem_map.files import ownership
 from gnss_sem_map.files.atomic import link_or_copy
-from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_folder
@@ -30,13 +29,13 @@ from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.checkpoints import objects_from_json
-from gnss_sem_map.mapping.raw_map import MAP, write_sum
+from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import Refined
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
-from gnss_sem_map.runs import pipeline
 from gnss_sem_map.runs.about import about_map, seconds_of
 from gnss_sem_map.runs.binding import BoundDrives
 from gnss_sem_map.runs.drive_job import DriveJob
+from gnss_sem_map.runs.drive_tasks import FINISHED, PLACED
 from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_folder import write_about, write_map_files
@@ -50,78 +49,72 @@ OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
 """Files of a drive beside its map, evidence and trajectory."""
 
 
-def write_drives(
-    out: Path,
-    drives: Mapping[str, Path],
+@dataclass(frozen=True, eq=False)
+class RefinedMap:
+    """A refined map in its folder: what refinement says beside it, and how long it took."""
+
+    folder: Path
+    refined: Refined
+    stats: RunStats
+
+
+def link_drives(drives: Mapping[str, Path], folder: Path) -> list[Path]:
+    """Link `drives`, name -> folder, into that of a map; returns their folders there."""
+    parts = [folder / DRIVES / name for name in sorted(drives)]
+    for part in parts:
+        link_map(drives[part.name], part)
+        for name in OF_ONE_DRIVE:
+            link_or_copy(drives[part.name] / name, part / name)
+    return parts
+
+
+def deliver_drives(
+    made: RefinedMap,
     bound: BoundDrives,
     run: MapJob,
     labelled: Sequence[Source] = (),
     align_to: Path | None = None,
 ) -> dict[str, Any]:
-    """Write the map of several `drives`, name -> folder, into `out`, and the point labels of the `labelled`.
+    """Write all files of a map of several drives beside it, and the point labels of those that are `labelled`.
 
     Returns the content of run.json, with the drives that failed.
     """
-    settings, stats, label_set = run.settings, RunStats(), open_label_set(run.settings.classes)
+    folder, settings, stats = made.folder, run.settings, made.stats
+    label_set, parts = open_label_set(settings.classes), sorted((folder / DRIVES).iterdir())
     assert run.frame is not None
-    with new_folder(out) as folder:
-        parts = [folder / DRIVES / name for name in sorted(drives)]
-        for part in parts:
-            _link_map(drives[part.name], part)
-            for name in OF_ONE_DRIVE:
-                link_or_copy(drives[part.name] / name, part / name)
-        with stats.stage("mapping"):
-            write_sum(parts, folder, run.frame, settings.classes, out, executor=run.executor, work=run.work)
-        # tiles that are taken from an earlier map do not say which points of kerbs are which
-        refined = _refined(folder, run, stats, None if labelled else out)
-        of_drives = (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled)
+    of_drives = (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled)
+    with stats.stage("labels"):
+        write_point_labels(folder, of_drives, made.refined.kerbs, settings, run.progress)
+    with stats.stage("changes"):
+        changes = changes_in(folder, parts, bound.passes, label_set)
+    if changes is not None:
+        write_changes(changes, Georeference.of(run.frame, settings.delivery), label_set, folder)
+    join_movers(parts, folder)
+    about = _about_drives(parts, run.failed, bound, align_to) | {
+        "local_frame": asdict(run.frame),
+        "changes": [change.about(label_set) for change in changes or ()],
+        "map": about_map(folder, made.refined.report),
+    }
+    about["warnings"] += stats.warnings
+    return write_summary(folder, settings, about, run.progress)
+
+
+def deliver_one(made: RefinedMap, job: DriveJob, run: MapJob, write_labels: bool) -> None:
+    """Write all files of a map of one drive beside it, with point labels if they are wanted."""
+    folder, settings, stats = made.folder, run.settings, made.stats
+    tracked, about = job.needed(FINISHED).about, read_run(job.made)
+    objects = objects_from_json(tracked["objects"])
+    report = replace(made.refined.report, tracked=objects, untracked=tracked["untracked"])
+    track = Trajectory(**job.needed(PLACED).of("track"))  # not rounded, as that in files
+    if write_labels:
         with stats.stage("labels"):
-            write_point_labels(folder, of_drives, refined.kerbs, settings, run.progress)
-        with stats.stage("changes"):
-            changes = changes_in(folder, parts, bound.passes, label_set)
-        if changes is not None:
-            write_changes(changes, Georeference.of(run.frame, settings.delivery), label_set, folder)
-        join_movers(parts, folder)
-        about = _about_drives(parts, run.failed, bound, align_to) | {
-            "local_frame": asdict(run.frame),
-            "changes": [change.about(label_set) for change in changes or ()],
-            "map": about_map(folder, refined.report),
-        }
-        about["warnings"] += stats.warnings
-        return write_summary(folder, settings, about, run.progress)
-
-
-def write_one(out: Path, job: DriveJob, run: MapJob, write_labels: bool) -> dict[str, Any]:
-    """Write the map of one drive into `out`, with point labels if they are wanted; returns the content of run.json."""
-    settings, stats = run.settings, RunStats()
-    with new_folder(out) as folder:
-        _link_map(job.made, folder)
-        refined = _refined(folder, run, stats)
-        tracked = job.needed("finished").about
-        report = replace(
-            refined.report,
-            tracked=objects_from_json(tracked["objects"]),
-            untracked=tracked["untracked"],
-        )
-        track = Trajectory(**job.needed("placed").of("track"))  # not rounded, as that in files
-        if write_labels:
-            with stats.stage("labels"):
-                drives = [replace(_labelled(job.source, folder, settings), trajectory=track)]
-                write_point_labels(folder, drives, refined.kerbs, settings, run.progress)
-        about = read_run(job.made)
+            drives = [replace(_labelled(job.source, folder, settings), trajectory=track)]
+            write_point_labels(folder, drives, made.refined.kerbs, settings, run.progress)
+    with stats.stage("export"):
         tracks = [track.during(*about["scans_s"])]
-        with stats.stage("export"):
-            write_map_files(folder, tracks, str(about["name"]), settings.delivery, progress=run.progress)
-        return write_about(
-            folder, settings, _about_one(about, stats) | {"map": about_map(folder, report)},
-            read_json(job.made / "metrics.json"),
-        )  # fmt: skip
-
-
-def _refined(folder: Path, run: MapJob, stats: RunStats, earlier: Path | None = None) -> Refined:
-    return pipeline.refine(
-        folder, run.settings, stats, run.progress, earlier, executor=run.executor, work=run.work
-    )
+        write_map_files(folder, tracks, str(about["name"]), settings.delivery, progress=run.progress)
+    about = _about_one(about, stats) | {"map": about_map(folder, report)}
+    write_about(folder, settings, about, read_json(job.made / "metrics.json"))
 
 
 def _about_one(about: dict[str, Any], stats: RunStats) -> dict[str, Any]:
@@ -181,7 +174,7 @@ def _summary(drive: Path) -> dict[str, Any]:
     }
 
 
-def _link_map(drive: Path, part: Path) -> None:
+def link_map(drive: Path, part: Path) -> None:
     """Link the map and the trajectory of one drive, out of its own folder or out of a run of this drive alone."""
     part.mkdir(parents=True, exist_ok=True)
     for name in (MAP, ATTRIBUTES, evidence.FOLDER):

@@ -62,7 +62,7 @@ from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabil
 from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.voxels.reuse import digest
 
-CHECKED, LOCATED, PLACED = "checked", "located", "placed"
+CHECKED, LOCATED, PLACED, FINISHED = "checked", "located", "placed", "finished"
 GROUP, ALONE = "group", "alone"
 """How a drive moves because it is bound to others, and to itself (`runs.binding`)."""
 
@@ -267,11 +267,7 @@ def place(folder: str, key: str, located: str, bound: str) -> dict[str, Any]:
 def _labelled(drive: OpenDrive, track: Trajectory) -> Drive:
     """The drive in the map, with a network whose answers are kept: no image is segmented twice."""
     job, network = drive.job, drive.network
-    log = (
-        in_frame(drive.log, track, job.origin)[0]
-        if job.origin is None
-        else replace(drive.log, frame=job.origin)
-    )
+    log = drive.log if job.origin is None else replace(drive.log, frame=job.origin)
     made = Drive(log, track, network, job.settings, job.saved if job.saved.is_dir() else None)
     if network is None or not log.cameras or isinstance(network, CachedLabels):
         return made
@@ -309,29 +305,20 @@ def _to_map(folder: str, key: str, mapped: str) -> tuple[Drive, ChunkStore]:
 
 def finish(folder: str, key: str, steps: dict[str, str], mapping_s: float) -> None:
     """Write the map of a drive, whose `steps` have these digests, into a folder of its own. Raises DataError."""
-    drive, (mapped, store) = opened(folder, key), _to_map(folder, key, steps["mapped"])
-    job, settings, stats = drive.job, drive.job.settings, RunStats()
-    checked, located = job.needed(CHECKED), job.needed(LOCATED, steps["located"])
-    placed, (_, is_own, bound) = job.needed(PLACED), correction_of(job, steps["bound"])
-    for found in (checked.about, located.about, bound):
-        stats += RunStats.of(found["stats"])
-    if located.about["other_clock"]:
-        stats.warnings.append(located.about["other_clock"])
-    stats += RunStats.of(placed.about["stats"])
+    (mapped, store), job = _to_map(folder, key, steps["mapped"]), job_of(folder, key)
+    settings, stats = job.settings, RunStats()
+    checked, located, placed = (job.needed(name).about for name in (CHECKED, LOCATED, PLACED))
+    _, is_own, bound = correction_of(job, steps["bound"])
+    for part in (checked, located, bound, placed):
+        stats += RunStats.of(part["stats"])
+        if part is bound and located["other_clock"]:
+            stats.warnings.append(located["other_clock"])
     with writing_to(job.folder):
         beside = unfinished(job.made)
         beside.mkdir()
         try:
             with stats.stage("export"):
-                track, *alone = _tracks(
-                    job, drive.log, steps["located"], steps["bound"], with_covariances=True
-                )
-                run_folder.write_trajectory_files(
-                    beside, mapped.log, track, alone[0] if alone else None, located.arrays.get("rejected")
-                )
-                if "plot" in located.arrays:
-                    located.arrays["plot"].tofile(beside / "trajectory.png")
-                del track, alone  # with their covariances
+                _write_trajectory(job, mapped.log, steps, beside)
             stats.seconds["mapping"] = mapping_s
             with stats.stage("mapping"):
                 fusion.summarise(mapped, store, stats)
@@ -340,21 +327,33 @@ def finish(folder: str, key: str, steps: dict[str, str], mapping_s: float) -> No
             about = about_run(job.name, mapped.log, stats) | {
                 "inputs": job.source.inputs,
                 "scans_s": [mapped.log.scans[0].stamp, mapped.log.scans[-1].stamp],
-                "preflight": checked.about["page"],
-                "trajectory": located.about["solution"],
-                "from_lidar_odometry": located.about["from_lidar_odometry"],
+                "preflight": checked["page"],
+                "trajectory": located["solution"],
+                "from_lidar_odometry": located["from_lidar_odometry"],
                 "passes": bound["passes"] if is_own else [],
-                "read": checked.about["read"],
+                "read": checked["read"],
                 "correction": "" if is_own else bound["correction"],
             }
-            run_folder.write_about(beside, settings, about, {"sharpness": placed.about["sharpness"]})
+            run_folder.write_about(beside, settings, about, {"sharpness": placed["sharpness"]})
             tracked = {"objects": store.objects_as_json(), "untracked": store.untracked()}
-            remember(job.folder / "finished.npz", key, tracked, {})
+            remember(job.folder / f"{FINISHED}.npz", key, tracked, {})
             ownership.write_list(beside, all_content=True)
             _put(beside, job, about)
         finally:
             shutil.rmtree(beside, ignore_errors=True)
-        work_folder.remove_chunks(job.folder)
+
+
+def _write_trajectory(job: DriveJob, log: SensorLog, steps: dict[str, str], folder: Path) -> None:
+    """Write the trajectory of a drive, with covariances, in all formats, and the plot of it."""
+    found = job.needed(LOCATED, steps["located"])
+    track, *alone = _tracks(
+        job, opened(*job.key).log, steps["located"], steps["bound"], with_covariances=True
+    )
+    run_folder.write_trajectory_files(
+        folder, log, track, alone[0] if alone else None, found.arrays.get("rejected")
+    )
+    if "plot" in found.arrays:
+        found.arrays["plot"].tofile(folder / "trajectory.png")
 
 
 def write_map(drive: Drive, store: ChunkStore, folder: Path, stats: RunStats) -> None:
@@ -367,8 +366,11 @@ def write_map(drive: Drive, store: ChunkStore, folder: Path, stats: RunStats) ->
 
 def _put(beside: Path, job: DriveJob, about: dict[str, Any]) -> None:
     """Give the folder its name; a cluster may have called the task twice, and then the first one stays."""
-    if job.made.is_dir():
-        if ownership.is_whole(job.made) and job.is_made(about["read"], about["correction"]):
-            return
-        shutil.rmtree(job.made)
-    beside.rename(job.made)
+    if job.is_made(about["read"], about["correction"]) and ownership.is_whole(job.made):
+        return
+    shutil.rmtree(job.made, ignore_errors=True)
+    try:
+        beside.rename(job.made)
+    except OSError:
+        if not job.is_made(about["read"], about["correction"]):
+            raise

@@ -43,11 +43,10 @@ from gnss_sem_map.mapping.classifying import OFF
 from gnss_sem_map.mapping.fusion import map_scans, without_images
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
-from gnss_sem_map.process.execution import InProcess
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import pipeline, run_folder
 from gnss_sem_map.runs.about import about_map, about_skips
-from gnss_sem_map.runs.delivery import write_one, write_summary
+from gnss_sem_map.runs.delivery import write_summary
 from gnss_sem_map.runs.drive_job import closing_drives, give, job_for
 from gnss_sem_map.runs.drive_tasks import write_map
 from gnss_sem_map.runs.executors import executor_of
@@ -115,14 +114,12 @@ def run(
             return Run(out)
         begin(claim.work, resume)
         with executor_of(workers, scheduler, claim.work, places) as executor:
-            making = MapJob(
-                settings, origin or log.frame, claim.work, executor or InProcess(), progress, True
-            )
+            making = MapJob(settings, origin or log.frame, claim.work, executor, progress, True)
             job = job_for(source, making, force)
             with closing_drives():
                 give(job, log)
                 pipeline.bound_and_mapped([job], making)
-            write_one(out, job, making, write_labels)
+            pipeline.write_one(out, job, making, write_labels)
     return Run(out)
 
 

@@ -26,14 +26,13 @@ from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES, REMOVED
 from gnss_sem_map.mapping.raw_map import MAP
-from gnss_sem_map.process.execution import InProcess
 from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.runs import pipeline, run_folder
 from gnss_sem_map.runs.binding import bind, groups_near, refuse_unbindable, with_unheld
-from gnss_sem_map.runs.delivery import write_drives
 from gnss_sem_map.runs.drive_job import closing_drives, job_for
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.map_job import MapJob
+from gnss_sem_map.runs.pipeline import write_drives
 from gnss_sem_map.runs.run_settings import read_settings
 from gnss_sem_map.runs.same_run import is_map_of
 from gnss_sem_map.runs.source import Source, source_of
@@ -104,7 +103,7 @@ def run_drives(
             return _finished_before(claim)
         begin(claim.work, how.resume)
         with executor_of(workers, scheduler, claim.work, places) as executor:
-            run = MapJob(settings, frame, claim.work, executor or InProcess(), progress)
+            run = MapJob(settings, frame, claim.work, executor, progress)
             base = _base(align_to, run)
             jobs = [job_for(source, run, force=how.force) for source in sources]
             with closing_drives():
@@ -147,7 +146,7 @@ def add_drive(
         _check_distinct([*known, (drive.name, drive)])
         begin(claim.work, how.resume)
         with executor_of(workers, scheduler, claim.work, _places_read(there, added, settings)) as executor:
-            run = MapJob(settings, frame, claim.work, executor or InProcess(), progress)
+            run = MapJob(settings, frame, claim.work, executor, progress)
             return ManyDrives(out, _changed(out, there, added, how.force, run))
 
 
@@ -189,7 +188,7 @@ def remove_drive(
         begin(claim.work, resume)
         write_record({"name": name}, claim.work / REMOVED)
         with executor_of(workers, scheduler, claim.work, _places_read(stay, [], settings)) as executor:
-            run = MapJob(settings, frame, claim.work, executor or InProcess(), progress)
+            run = MapJob(settings, frame, claim.work, executor, progress)
             return ManyDrives(out, _changed(out, stay, [], True, run))
 
 

@@ -68,10 +68,10 @@ def is_run_file(name: str) -> bool:
 
 @contextmanager
 def claimed_run(
-    out: Path, inputs: Iterable[Path | str | None] = (), is_resumable: bool = False, waits: bool = False
+    out: Path, inputs: Iterable[Path | str | None] = (), is_resumable: bool = False
 ) -> Iterator[Claim]:
     """Hold the output folder of a run exclusively; see `files.output_folder.claimed`."""
-    with claimed(out, inputs, is_run_file, is_resumable, waits) as claim, leaving_all():
+    with claimed(out, inputs, is_run_file, is_resumable) as claim, leaving_all():
         yield claim
 
 

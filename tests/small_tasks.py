@@ -109,7 +109,7 @@ def is_wrong(kind: str) -> None:
 
 def fails(how: str) -> str:
     """Says why it failed, as the mapping of a drive does."""
-    return str(attempt("small_tasks:is_wrong", [how])["failed"])
+    return str(attempt("small_tasks:is_wrong", [how], "small_tasks.")["failed"])
 
 
 def dies_once(folder: str) -> bool:

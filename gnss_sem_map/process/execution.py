@@ -70,10 +70,10 @@ def report(done: int) -> None:
     getattr(_of_thread, "report", lambda done: None)(done)
 
 
-def attempt(function: str, arguments: list[Any]) -> dict[str, Any]:
+def attempt(function: str, arguments: list[Any], allowed: str = ALLOWED) -> dict[str, Any]:
     """Call another task: its `result`, or why it `failed`, by an error of ours or of the system. A task."""
     try:
-        return {"result": _function(function)(*arguments)}
+        return {"result": _function(function, allowed)(*arguments)}
     except (SemMapError, FactorGraphError, OSError) as error:
         return {"failed": _told(error)}
 
@@ -157,15 +157,15 @@ def call(function: str, arguments: str, allowed: str = ALLOWED) -> str:
 
     Raises ConfigError for a function outside the modules that are allowed.
     """
-    if not f"{function.partition(':')[0]}.".startswith(allowed):
-        raise ConfigError(f"{function}: may not be called as a task; expected a function of {allowed}*")
-    called = _function(function)
+    called = _function(function, allowed)
     with one_blas_thread():
         return json.dumps(called(*json.loads(arguments)))
 
 
-def _function(path: str) -> Callable[..., Any]:
+def _function(path: str, allowed: str) -> Callable[..., Any]:
     module, _, name = path.partition(":")
+    if not f"{module}.".startswith(allowed):
+        raise ConfigError(f"{path}: may not be called as a task; expected a function of {allowed}*")
     try:
         found: Callable[..., Any] = getattr(import_module(module), name)
     except (ModuleNotFoundError, AttributeError) as error:

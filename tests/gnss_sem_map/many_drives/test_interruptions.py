@@ -45,7 +45,7 @@ import os, signal, sys
 def look(event, details):
     place = os.fsdecode(details[1]) if event == "os.rename" else ""
     folder, _, name = place.rpartition("/")
-    if folder.endswith("/drives/.b.work") and name.isdecimal():  # a chunk of its scans is put away
+    if folder.endswith("/drives") and name == "b":  # its map is put away
         os.kill(os.getpid(), signal.SIGKILL)
 
 sys.addaudithook(look)

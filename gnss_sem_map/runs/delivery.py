@@ -34,8 +34,8 @@ from gnss_sem_map.mapping.refining import Refined
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs.about import about_map, seconds_of
 from gnss_sem_map.runs.binding import BoundDrives
-from gnss_sem_map.runs.drive_job import DriveJob
-from gnss_sem_map.runs.drive_tasks import FINISHED, PLACED
+from gnss_sem_map.runs.drive_job import FINISHED, DriveJob
+from gnss_sem_map.runs.drive_tasks import PLACED
 from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_folder import write_about, write_map_files

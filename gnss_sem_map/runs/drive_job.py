@@ -30,6 +30,9 @@ from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.reuse import digest
 
+FINISHED = "finished"
+"""What is known of the map of a drive beside its folder."""
+
 
 @dataclass(frozen=True, eq=False)
 class DriveJob:
@@ -87,7 +90,8 @@ class DriveJob:
 
     def is_made(self, read: str, correction: str) -> bool:
         """Whether the map is there, of what was `read` (a digest) and with this digest of the correction."""
-        return is_made_from(self.made, self.source, self.settings, self.origin, read, correction)
+        what = self.source, self.settings, self.origin, read, correction
+        return self.found(FINISHED, self.key[1]) is not None and is_made_from(self.made, *what)
 
     def _about(self) -> dict[str, object]:
         return {

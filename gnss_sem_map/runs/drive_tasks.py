@@ -54,7 +54,7 @@ from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.about import about_run, about_solution
-from gnss_sem_map.runs.drive_job import DriveJob, OpenDrive, job_of, opened, other_drive
+from gnss_sem_map.runs.drive_job import FINISHED, DriveJob, OpenDrive, job_of, opened, other_drive
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_section, sections_of
 from gnss_sem_map.scans.local_maps import sweeps_along
 from gnss_sem_map.segmentation.cached import CachedLabels
@@ -62,7 +62,7 @@ from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabil
 from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.voxels.reuse import digest
 
-CHECKED, LOCATED, PLACED, FINISHED = "checked", "located", "placed", "finished"
+CHECKED, LOCATED, PLACED = "checked", "located", "placed"
 GROUP, ALONE = "group", "alone"
 """How a drive moves because it is bound to others, and to itself (`runs.binding`)."""
 

@@ -262,7 +262,7 @@ def begin(work: Path, resume: bool) -> None:
     """Prepare the work folder of a map; raises DataError."""
     with work_folder.writing_to(work):
         if not resume:
-            work_folder.clear(work)
+            work_folder.remove_drives(work)
         (work / REMOVED).unlink(missing_ok=True)
         work_folder.make(work)
         (work / DRIVES).mkdir(exist_ok=True)

@@ -35,6 +35,7 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.runs import pipeline
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate
@@ -128,7 +129,9 @@ def mapped(excerpt: Excerpt, drive: Drive, settings: Settings, only: Labels) -> 
     sure: tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]] = ({}, {})
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        done = pipeline.run(drive.log, drive.segmenter, settings, folder, folder / "work")
+        run = MapJob(settings, drive.log.frame, folder / "work", is_one=True)
+        done = pipeline.map_log(drive.log, drive.segmenter, run)
+        folder = done.folder
         kerbs = pipeline.refine(folder, settings, done.stats).kerbs
         maps = [tiles.open_map(folder / name, URBAN) for name in ("map", "refined")]
         moving = evidence.read(folder, URBAN).moving_points
@@ -144,8 +147,8 @@ def learn(drives: list[tuple[Excerpt, Drive]]) -> LabelCalibration:
     counted = []
     for excerpt, drive in drives:
         with tempfile.TemporaryDirectory() as folder:
-            pipeline.run(drive.log, drive.segmenter, drive.settings, Path(folder), Path(folder) / "work")
-            raw = tiles.read(Path(folder) / "map", URBAN)
+            run = MapJob(drive.settings, drive.log.frame, Path(folder) / "work", is_one=True)
+            raw = tiles.read(pipeline.map_log(drive.log, drive.segmenter, run).folder / "map", URBAN)
         counted.append(measure(drive, raw.voxels, label_files(excerpt.truth)))
     points = zip(*(points for _, points in counted), strict=True)
     temperature = fit_temperature(*(np.concatenate(parts) for parts in points))

@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_info
 
 from gnss_sem_map.errors import DataError, WriteError
-from gnss_sem_map.process.execution import failure_of
+from gnss_sem_map.process.execution import attempt
 from gnss_sem_map.process.machine import threads
 
 
@@ -109,7 +109,7 @@ def is_wrong(kind: str) -> None:
 
 def fails(how: str) -> str:
     """Says why it failed, as the mapping of a drive does."""
-    return failure_of(lambda: is_wrong(how))
+    return str(attempt("small_tasks:is_wrong", [how], "small_tasks.")["failed"])
 
 
 def dies_once(folder: str) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import logging
 import os
 import socket
 import stat
@@ -61,13 +60,12 @@ def claimed(
     inputs: Iterable[Path | str | None] = (),
     by_name: Callable[[str], bool] = lambda name: False,
     is_resumable: bool = False,
-    waits: bool = False,
 ) -> Iterator[Claim]:
     """Claim an output folder, and check before any work that results can be written there.
 
     What a killed command left in the work folder is put right: the old result is moved back, an unfinished new one is
     removed. Intermediate results stay until the run is complete; an error says so if the command `is_resumable`: if it
-    has --resume. Raises DataError when another command writes there (or `waits` for it), when what is there is not
+    has --resume. Raises DataError when another command writes there, when what is there is not
     ours, when it is, holds or lies in one of the `inputs`, and when it may not be changed.
     """
     real = real_path(out)
@@ -78,7 +76,7 @@ def claimed(
     claim = Claim(real, by_name)
     refuse_places(real)
     refuse_inputs(real, inputs)
-    with parents_made(real), locked(real, waits):
+    with parents_made(real), locked(real):
         work_folder.refuse_foreign(claim.work)
         with _explained(claim.work):
             _move_back(claim)
@@ -289,18 +287,18 @@ def parents_made(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def locked(out: Path, waits: bool = False) -> Iterator[None]:
+def locked(out: Path) -> Iterator[None]:
     """Lock an output folder with `.OUT.lock`, which names the process. The lock of a dead process is ignored.
 
-    What this process has claimed is locked already. Raises DataError when another command writes there (or `waits`
-    until it has ended), or the lock cannot be written.
+    What this process has claimed is locked already. Raises DataError when another command writes there, or
+    the lock cannot be written.
     """
     if out in _HELD:
         yield
         return
     path = out.with_name(f".{out.name}.lock")
     try:
-        file = _lock(path, out, waits)
+        file = _lock(path, out)
     except OSError as error:
         raise DataError(
             f"{out}: cannot be written ({error.strerror}); see to its rights, or choose another place"
@@ -311,12 +309,6 @@ def locked(out: Path, waits: bool = False) -> Iterator[None]:
         finally:
             with suppress(OSError):
                 path.unlink()
-
-
-def refuse_locked(folder: Path) -> None:
-    """Raise DataError when something in a folder of ours is locked: then a task of an earlier run still writes it."""
-    for path in sorted(folder.glob(".*.lock")):
-        _lock(path, folder / path.name[1 : -len(".lock")], waits=False).close()
 
 
 @contextmanager
@@ -354,7 +346,7 @@ def _refuse_replaced(opened: Mapping[Path, int]) -> None:
             raise DataError(f"{folder}: was replaced by another command while it was read; run this again")
 
 
-def _lock(path: Path, out: Path, waits: bool) -> TextIO:
+def _lock(path: Path, out: Path) -> TextIO:
     while True:
         number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
         if not stat.S_ISREG(os.fstat(number).st_mode):
@@ -365,12 +357,8 @@ def _lock(path: Path, out: Path, waits: bool) -> TextIO:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = file.read(200).strip() or f"{FIRST_WORDS} it"
-            if not waits:
-                file.close()
-                raise DataError(f"{out}: {holder}; wait for it, or choose another -o") from None
-            logging.getLogger("gnss-sem-map").warning("%s: %s; waiting for it", out, holder)
-            fcntl.flock(file, fcntl.LOCK_EX)
-            file.seek(0)
+            file.close()
+            raise DataError(f"{out}: {holder}; wait for it, or choose another -o") from None
         except OSError as error:
             if error.errno not in NO_LOCKS:
                 file.close()

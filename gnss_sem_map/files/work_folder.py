@@ -1,21 +1,24 @@
 """Work folder: hidden beside the result; holds intermediate results, and the new result until it is complete.
 
 .OUT.work/.gnss-sem-map.json     says that we made this folder
-          chunks.json, 0/, 1/    mapped chunks of scans (`mapping.checkpoints`)
-          edges/                 what the edges of ranges of chunks tell of motion (`mapping.edge_windows`)
-          job.json, trajectory.npz   what other processes need to map chunks (`runs.drive_job`)
-          matches/               LiDAR odometry of sections of the drive (`runs.match_tasks`)
-          sweeps/                sweeps that later stages need, thinned (`scans.thinned_sweeps`)
-          revisits/              places that are passed again, registered (`runs.revisit_tasks`)
-          answers/               class probabilities of the images (`segmentation.cached_segmenter`)
-          drives/NAME/           the maps of single drives (`runs.many_drives`)
-          bound/NAME/            where these were driven, and how they are bound (`runs.bound_drives`)
+          drives/.NAME.work/     what was found on the way of one drive (`runs.drive_tasks`)
+          drives/NAME/           the map of one drive
           removed.json           the drive that is taken out of a map of several (`runs.many_drives`)
           tiles/refined/         tiles of a map that is being made (`mapping.tile_tasks`)
-          .0.12.waiting/         points of a chunk that may have moved (`mapping.waiting_points`), the images of the
-                                 scans before it (`mapping.waiting_images`), and tables that wait (`mapping.chunks`)
           part/                  the new result while it is written
           old/                   the result before it, from when it is replaced until it is removed
+
+Of one drive:
+
+job.json                         what it is mapped from, and how (`runs.drive_job`)
+checked.npz, located.npz, ...    what its tasks found, files of the memo (`files.memo`)
+matches/N.npz, revisits/N.npz    of a section of its scans; of some pairs of places that are passed again
+sweeps/                          sweeps that later stages need, thinned (`scans.thinned_sweeps`)
+answers/                         class probabilities of the images (`segmentation.cached_segmenter`)
+chunks.json, 0/, 1/              mapped chunks of scans (`mapping.checkpoints`)
+edges/                           what the edges of ranges of chunks tell of motion (`mapping.edge_windows`)
+.0.12.waiting/                   points of a chunk that may have moved (`mapping.waiting_points`), the images of the
+                                 scans before it (`mapping.waiting_images`), and tables that wait (`mapping.chunks`)
 """
 
 from __future__ import annotations
@@ -32,20 +35,20 @@ from gnss_sem_map.files import ownership
 
 CHUNKS, MATCHES, SWEEPS, REVISITS = "chunks.json", "matches", "sweeps", "revisits"
 ANSWERS, DRIVES = "answers", "drives"
-BOUND, TILES, EDGES, PART, OLD = "bound", "tiles", "edges", "part", "old"
-JOB, TRAJECTORY, REMOVED = "job.json", "trajectory.npz", "removed.json"
+TILES, EDGES, PART, OLD = "tiles", "edges", "part", "old"
+JOB, REMOVED = "job.json", "removed.json"
 OF_CHUNKS = re.compile(
-    r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
+    r"\.[^/]+\.\d+\.part|chunks\.json|trajectory\.npz"
     r"|(\d+|\.\d+\.\d+\.part)/((record\.json|\w+\.npz|\w+/|\w+/-?\d+_-?\d+\.parquet)?|(\w+/)?\.[^/]+\.\d+\.part)"
     r"|\.\d+\.\d+\.waiting/((\d+|images)\.npy|\d+\.table)?|edges/(\d+\.npz|\.[^/]+\.\d+\.part)?"
 )
 OURS = re.compile(
     r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|([\w-]+/)?(\d+\.npz|\.[^/]+\.\d+\.part)?)"
-    r"|(matches|revisits)/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
+    r"|(matches|revisits)/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?|job\.json|(checked|located|group|alone|placed|finished)\.npz"
     r"|removed\.json|\.removed\.json\.\d+\.part|sweeps/(about\.json|\d+\.\w+\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
-"""Pattern of all paths that we write into a work folder."""
+"""Pattern of all paths that we write into a work folder, or the version before this one did."""
 
 
 def make(folder: Path) -> None:
@@ -90,7 +93,7 @@ def refuse_foreign(folder: Path) -> None:
 def holds_work(folder: Path) -> bool:
     """Whether there are intermediate results for --resume, also in the work folders of single drives."""
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
-    kept = ((MATCHES, "*.npz"), (ANSWERS, "**/*.npz"), (DRIVES, "*/run.json"), (BOUND, f"*/{JOB}"))
+    kept = ((MATCHES, "*.npz"), (ANSWERS, "**/*.npz"), (DRIVES, "*/run.json"))
     return (
         done
         or any(any((folder / place).glob(files)) for place, files in kept)
@@ -117,9 +120,9 @@ def clear(folder: Path) -> None:
 
 
 def remove_drives(folder: Path) -> None:
-    """Remove the maps of single drives, how they are bound, and tiles that were made from them; raises OSError."""
+    """Remove the maps of single drives, what they are made from, and tiles that were made from them; raises OSError."""
     _remove_ours(folder / DRIVES)
-    _remove_ours(folder / BOUND)
+    _remove_ours(folder / "bound")  # of the version before
     _remove_ours(folder / TILES)
 
 
@@ -133,8 +136,13 @@ def remove_damaged_drives(folder: Path) -> None:
 def remove_matches(folder: Path) -> None:
     """Remove saved LiDAR odometry, its sweeps, and what was registered along it; raises OSError."""
     _remove_known(folder, folder / MATCHES)
-    _remove_known(folder, folder / SWEEPS)
     _remove_known(folder, folder / REVISITS)
+    remove_sweeps(folder)
+
+
+def remove_sweeps(folder: Path) -> None:
+    """Remove saved sweeps; raises OSError."""
+    _remove_known(folder, folder / SWEEPS)
 
 
 def remove_answers(folder: Path) -> None:

@@ -18,7 +18,7 @@ import hashlib
 import io
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, reduce
 from operator import add
@@ -49,7 +49,7 @@ MOVING_POINTS, KEYFRAMES = "moving_points.npz", "keyframes.npz"
 
 @dataclass(frozen=True, eq=False)
 class ChunkStore:
-    """The chunks of one run; `open_store` makes it."""
+    """The chunks of one run; `begun` prepares the folder."""
 
     folder: Path
     fingerprint: str
@@ -58,6 +58,43 @@ class ChunkStore:
     """Number of chunks of the whole drive."""
     voxel_size_m: float
     label_set: LabelSet
+
+    def begun(self, resume: bool) -> ChunkStore:
+        """The store, with its folder: with `resume` it has the undamaged chunks of an interrupted run, else none.
+
+        Raises DataError when the interrupted run had other files or settings, or the folder holds something else.
+        """
+        folder = self.folder
+        work_folder.make(folder)
+        about = folder / work_folder.CHUNKS
+        known = _fingerprint(about) if resume else None
+        if known not in (None, self.fingerprint):
+            raise DataError(
+                f"{folder}: the interrupted run had another drive, trajectory, labels, settings or version of this"
+                " package, or a file was changed since; run it as it was begun, or without --resume"
+            )
+        try:
+            if known is None:
+                work_folder.remove_chunks(folder)
+                write_whole(
+                    about, json.dumps({"fingerprint": self.fingerprint, "chunks": self.count}).encode()
+                )
+            for path in (*folder.glob(".*.part"), *folder.glob(f".*{WAITING}")):
+                _remove(path)
+            for number in self.done():
+                if number >= self.count or not self.is_whole(number):
+                    _remove(folder / str(number))
+        except OSError as error:
+            raise DataError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
+        return self
+
+    def is_begun(self) -> bool:
+        """Whether the folder is that of this run."""
+        return _fingerprint(self.folder / work_folder.CHUNKS) == self.fingerprint
+
+    def pending(self) -> list[int]:
+        """Numbers of the chunks that are not saved."""
+        return sorted(set(range(self.count)) - self.done())
 
     def done(self) -> set[int]:
         """Numbers of the saved chunks."""
@@ -103,7 +140,7 @@ class ChunkStore:
                 raise
             if self.is_whole(number):
                 return
-            if _fingerprint(self.folder / work_folder.CHUNKS) != self.fingerprint:
+            if not self.is_begun():
                 raise  # it is this run that has ended, and another one has begun
             shutil.rmtree(folder)
             beside.rename(folder)
@@ -127,7 +164,11 @@ class ChunkStore:
 
     def objects(self) -> tuple[TrackedObject, ...]:
         """The tracked objects of all chunks."""
-        return tuple(_object(one) for number in range(self.count) for one in self._record(number)["objects"])
+        return objects_from_json(self.objects_as_json())
+
+    def objects_as_json(self) -> list[dict[str, Any]]:
+        """The same for `objects_from_json`."""
+        return [one for number in range(self.count) for one in self._record(number)["objects"]]
 
     def untracked(self) -> int:
         """How many objects had too few points to be tracked: most of them, so they are only counted."""
@@ -238,6 +279,11 @@ def _about(one: TrackedObject) -> dict[str, Any]:
     return about if one.track is None else about | {"track": one.track.as_dict()}
 
 
+def objects_from_json(content: Sequence[Mapping[str, Any]]) -> tuple[TrackedObject, ...]:
+    """The objects that a store has as JSON."""
+    return tuple(map(_object, content))
+
+
 def _object(content: Mapping[str, Any]) -> TrackedObject:
     given = {
         "motion": Motion(content["motion"]),
@@ -246,37 +292,6 @@ def _object(content: Mapping[str, Any]) -> TrackedObject:
         "track": None if content["track"] is None else ObjectTrack.from_dict(content["track"]),
     }
     return TrackedObject(**{**content, **given})
-
-
-def open_store(
-    folder: Path, fingerprint: str, count: int, resume: bool, voxel_size_m: float, label_set: LabelSet
-) -> ChunkStore:
-    """A store for a run of `count` chunks that `fingerprint` identifies.
-
-    With `resume` it holds the undamaged chunks of an interrupted run, else none. Raises DataError when the interrupted
-    run had other files or other settings, or the folder holds something else.
-    """
-    work_folder.make(folder)
-    about = folder / work_folder.CHUNKS
-    store = ChunkStore(folder, fingerprint, count, voxel_size_m, label_set)
-    known = _fingerprint(about) if resume else None
-    if known not in (None, fingerprint):
-        raise DataError(
-            f"{folder}: the interrupted run had another drive, trajectory, labels, settings or version of this package,"
-            " or a file was changed since; run it as it was begun, or without --resume"
-        )
-    try:
-        if known is None:
-            work_folder.remove_chunks(folder)
-            write_whole(about, json.dumps({"fingerprint": fingerprint, "chunks": count}).encode())
-        for path in (*folder.glob(".*.part"), *folder.glob(f".*{WAITING}")):
-            _remove(path)
-        for number in store.done():
-            if number >= count or not store.is_whole(number):
-                _remove(folder / str(number))
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
-    return store
 
 
 def _fingerprint(about: Path) -> str | None:

@@ -124,8 +124,7 @@ def _map_chunks(
                 chunk.take_table_back()
                 before, undecided = undecided.last_images, None
             elif place == window and number > 0 and is_sought:
-                with writing_to(edges.work):
-                    edges.save(chunk.observations, first + number)
+                edges.save(chunk.observations, first + number)
             done += 1
             progress("mapping", done, total)
             release_memory()  # what lasts lies among what scans have used, and ten scans leave 70 MB of holes

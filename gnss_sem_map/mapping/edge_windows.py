@@ -6,8 +6,6 @@ scans itself, with the same result.
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,9 +19,7 @@ from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.observation import Observation
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.visibility import RangeImage
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.atomic import write_whole
-from gnss_sem_map.files.untrusted import is_file, read_bytes
+from gnss_sem_map.files.memo import recall, remember
 from gnss_sem_map.files.work_folder import EDGES
 
 
@@ -35,25 +31,16 @@ class EdgeWindows:
     fingerprint: str
 
     def save(self, observations: Sequence[Observation], chunk: int) -> None:
-        """Save the observations of the first window of a chunk; raises OSError."""
-        file = io.BytesIO()
-        arrays = {f"{n}/{name}": a for n, one in enumerate(observations) for name, a in _arrays(one).items()}
-        np.savez(file, **arrays, made_from=np.array(self.fingerprint))
-        (self.work / EDGES).mkdir(exist_ok=True)
-        write_whole(self._file(chunk), file.getvalue())
+        """Save the observations of the first window of a chunk; raises DataError."""
+        arrays = {f"{n}.{name}": a for n, one in enumerate(observations) for name, a in _arrays(one).items()}
+        remember(self._file(chunk), self.fingerprint, {"count": len(observations)}, arrays)
 
     def read(self, chunk: int, rows: Rows) -> list[Observation] | None:
         """Those of the first window of a chunk, by a LiDAR with these rows; None where they are not saved."""
-        try:
-            if not is_file(self._file(chunk)):
-                return None
-            with np.load(io.BytesIO(read_bytes(self._file(chunk))), allow_pickle=False) as arrays:
-                if str(arrays["made_from"]) != self.fingerprint:
-                    return None
-                count = len({name.partition("/")[0] for name in arrays.files} - {"made_from"})
-                return [_observation(arrays, f"{n}/", rows) for n in range(count)]
-        except (DataError, KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile):
+        found = recall(self._file(chunk), self.fingerprint)
+        if found is None:
             return None
+        return [_observation(found.of(str(n)), rows) for n in range(found.about["count"])]
 
     def _file(self, chunk: int) -> Path:
         return self.work / EDGES / f"{chunk}.npz"
@@ -70,9 +57,9 @@ def _arrays(one: Observation) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _observation(arrays: Mapping[str, NDArray[Any]], at: str, rows: Rows) -> Observation:
-    parts = PointSets(**{field.name: arrays[at + field.name] for field in fields(PointSets)})
-    segments = Segments(arrays[at + "keys"], parts, arrays[at + "number"], arrays[at + "truncated"])
-    seen = RangeImage(arrays[at + "image"], arrays[at + "T_lidar_map"], rows)
-    delays = SweepDelays(arrays[at + "delays"])
-    return Observation(int(arrays[at + "frame"]), float(arrays[at + "stamp"]), seen, segments, delays)
+def _observation(arrays: Mapping[str, NDArray[Any]], rows: Rows) -> Observation:
+    parts = PointSets(**{field.name: arrays[field.name] for field in fields(PointSets)})
+    segments = Segments(arrays["keys"], parts, arrays["number"], arrays["truncated"])
+    seen = RangeImage(arrays["image"], arrays["T_lidar_map"], rows)
+    delays = SweepDelays(arrays["delays"])
+    return Observation(int(arrays["frame"]), float(arrays["stamp"]), seen, segments, delays)

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import writing_to
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
+from gnss_sem_map.mapping.checkpoints import ChunkStore
 from gnss_sem_map.mapping.chunks import BLURRED, chunks_of, map_chunks
 from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive
@@ -29,9 +30,6 @@ from gnss_sem_map.sensor_log import Skip
 GEOMETRY_ONLY = "the map shows geometry only"
 """In every warning of a map without labels."""
 
-Elsewhere = Callable[[Drive, ChunkStore, Sequence[int]], Iterator[range]]
-"""Maps chunks of these numbers into the store in other processes; yields each range of them when it is done."""
-
 
 def map_scans(
     drive: Drive,
@@ -40,38 +38,39 @@ def map_scans(
     progress: Progress = silent,
     *,
     resume: bool = False,
-    elsewhere: Elsewhere | None = None,
     labels_from: str = "",
 ) -> ChunkStore:
     """Map all points of all scans (eq. 1 to 7): each at its own stamp, labelled by the nearest image in time.
 
     The chunks of the map are written into the folder `work`; with `resume`, those of an interrupted run are used if
-    drive, settings and `labels_from` (the source of the labels) are the same. The caller removes the folder. Chunks are
-    mapped in this process, or `elsewhere` (see `runs.chunk_tasks`). Raises DataError when no scan can be used, or
-    `work` cannot be written or holds something else.
+    drive, settings and `labels_from` (the source of the labels) are the same. The caller removes the folder. Raises
+    DataError when no scan can be used, or `work` cannot be written or holds something else.
     """
-    _warn(drive, stats)
+    fingerprint = fingerprints.of_map(drive, labels_from)
     chunks, total = chunks_of(drive), drive.log.scan_count
-    voxel_size_m = drive.settings.mapping.voxel_size_m
-    store = open_store(
-        work, fingerprints.of_map(drive, labels_from), len(chunks), resume, voxel_size_m, drive.label_set
-    )
-    there = store.done()
-    done = sum(len(chunks[number]) for number in there)
-    pending = [number for number in range(len(chunks)) if number not in there]
-    if elsewhere is not None and len(pending) > 1:
-        for numbers in elsewhere(drive, store, pending):
-            done += sum(len(chunks[number]) for number in numbers)
-            progress("mapping", done, total)
-    else:
-        for numbers in ranges(pending, len(chunks)):
-            map_range(drive, store, numbers, shifted(progress, done, total))
-            done += sum(len(chunks[number]) for number in numbers)
+    store = store_of(work, fingerprint, len(chunks), drive.settings).begun(resume)
+    pending = store.pending()
+    done = total - sum(len(chunks[number]) for number in pending)
+    for numbers in ranges(pending, len(chunks)):
+        map_range(drive, store, numbers, shifted(progress, done, total))
+        done += sum(len(chunks[number]) for number in numbers)
+    summarise(drive, store, stats)
+    return store
+
+
+def store_of(work: Path, fingerprint: str, count: int, settings: Settings) -> ChunkStore:
+    """So many chunks of a drive in a work folder."""
+    label_set = open_label_set(settings.classes)
+    return ChunkStore(work, fingerprint, count, settings.mapping.voxel_size_m, label_set)
+
+
+def summarise(drive: Drive, store: ChunkStore, stats: RunStats) -> None:
+    """Counts and skips of all chunks, and what there is to say of them; raises DataError when no scan can be used."""
+    _warn(drive, stats)
     for record in store.records():
         stats.counts.update(record["counts"])
         stats.skips.extend(Skip(**skip) for skip in record["skips"])
     _check(drive, stats)
-    return store
 
 
 def ranges(pending: Sequence[int], most: int) -> list[range]:

@@ -24,6 +24,7 @@ import numpy as np
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.visibility import origins_of
+from gnss_sem_map.files.memo import recall, remember
 from gnss_sem_map.geometric_classifier import features
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
@@ -50,7 +51,7 @@ from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.blocks import Block, blocks_of, bounds_of, tiles_around
 from gnss_sem_map.voxels.map_json import files_of, name_of
-from gnss_sem_map.voxels.reuse import Made, digest, of_map, of_work, read_record, save, write_record
+from gnss_sem_map.voxels.reuse import Made, digest, of_map, of_work, save
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.tiles import places_around
 from gnss_sem_map.voxels.voxel_map import VoxelMap, limits_of
@@ -188,7 +189,8 @@ class _Refinement:
         known = {}
         for block in self._blocks:
             in_map = earlier.get(name_of(block[0]), {}).get("said")
-            for said in (in_map, read_record(_sums_file(block, self.made_in))):
+            saved = recall(_sums_file(block, self.made_in), around[block])
+            for said in (in_map, None if saved is None else saved.about):
                 try:
                     if isinstance(said, dict) and said["around"] == around[block]:
                         known[block] = Sums.from_json(said["sums"])
@@ -289,7 +291,7 @@ def _measure(block: Block, inputs: _Inputs, around: str, made_in: Path) -> dict[
     around_block = inputs.raw.around(block, inputs.sums_halo)
     beside = Evidence(inputs.raw.evidence.moved.around(block, 0), inputs.model)
     sums = sums_of(block, around_block, beside, inputs.steps).to_json()
-    write_record({"around": around, "sums": sums}, _sums_file(block, made_in))
+    remember(_sums_file(block, made_in), around, {"around": around, "sums": sums}, {})
     return sums
 
 
@@ -328,7 +330,7 @@ MEASURE_BLOCKS, REFINE_BLOCKS = path_of(measure_blocks), path_of(refine_blocks)
 
 
 def _sums_file(block: Block, made_in: Path) -> Path:
-    return (made_in / name_of(block[0])).with_suffix(".sums.json")
+    return (made_in / name_of(block[0])).with_suffix(".sums.npz")
 
 
 def _packed(kerbs: Kerbs | None) -> dict[str, Any] | None:

@@ -5,7 +5,6 @@ Places that the drive passes again are bound to their first pass in the end (`ma
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,23 +18,15 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes, count_passes
-from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
 from gnss_sem_map.scans.local_maps import sweeps_along
-from gnss_sem_map.scans.revisits import Registrar
-from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.tile_files import Z_OFFSET
 
 MATCHED_SHARE = 0.95
 """With this share of matched scans, poses are accurate enough to tell slow objects from static ones."""
-
-Matcher = Callable[[SensorLog, Trajectory, Settings, Progress], ScanMatches]
-"""LiDAR odometry with a first trajectory."""
-RegistrarOf = Callable[[SensorLog, Trajectory, Settings], Registrar]
-"""Who registers the places that a drive passes again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +44,6 @@ class DriveTrajectory:
     """The trajectory before it was bound to itself; None where nothing binds it."""
     passes: tuple[TwoPasses, ...] = ()
     """What the drive passed again, and how well it fits."""
-    sweeps: ThinnedSweeps | None = None
-    """Along the track, for what is passed again; None if LiDAR odometry was not used."""
 
 
 def estimate_trajectory(
@@ -71,42 +60,80 @@ def locate(
     stats: RunStats,
     progress: Progress = silent,
     first: Solution | None = None,
-    match: Matcher | None = None,
     bound: bool = True,
-    registrar_of: RegistrarOf | None = None,
-    saved: Path | None = None,
 ) -> DriveTrajectory:
-    """The poses of the drive if it has some; else GNSS and IMU smoothed, then again with relative poses of its scans.
+    """The trajectory of a drive that is open, at once: `first_trajectory`, scan matching, `final_trajectory`.
 
-    Given poses that are measurements (see `matches_scans`) are smoothed with the relative poses, too.
-
-    `first` is the result of `smooth_log` for this log, if it is known already. `match` does the LiDAR odometry, by
-    default `match_scans` in this process. If not `bound`, places that are passed again stay as they are; else they are
-    registered by threads of this process, or as `registrar_of` says. `saved`: the folder of sweeps that `match` saves.
+    `first` is the result of `smooth_log` for this log, if it is known already. Places that are passed again are
+    registered, unless not `bound`.
     """
-    with_lidar = matches_scans(log, settings)
-    if log.given is not None and not with_lidar:
-        return DriveTrajectory(log.given)
     log = log.in_our_conventions(settings.sensors)
+    track, matches = first_trajectory(log, settings, first), None
+    if track is not None:
+        matches = match_scans(log, track, settings.trajectory.scan_matching, progress)
+    found = final_trajectory(log, settings, stats, track, matches)
+    drive = located(log, found)
+    if not bound or drive is None:
+        return found
+    together = bind_passes([drive], settings.trajectory.revisits)
+    count_passes(together, stats)
+    correction, found = together.corrections[0], replace(found, passes=together.passes)
+    if correction is None:
+        return found
+    return replace(found, trajectory=correction.of(found.trajectory), alone=found.trajectory)
+
+
+def first_trajectory(log: SensorLog, settings: Settings, first: Solution | None = None) -> Trajectory | None:
+    """The trajectory along which the scans of a drive are matched; None where none are.
+
+    `first` is the result of `smooth_log`, if it is known already. Raises as `smooth_log` does.
+    """
+    if not matches_scans(log, settings):
+        return None
     if log.given is not None:
-        matches, is_sharp = _matched(log, log.given, settings, stats, progress, match)
-        chosen = settings.trajectory
+        return log.given
+    return (first or smooth_log(log, _plain(settings.trajectory))).trajectory
+
+
+def final_trajectory(
+    log: SensorLog,
+    settings: Settings,
+    stats: RunStats,
+    first: Trajectory | None,
+    matches: ScanMatches | None,
+) -> DriveTrajectory:
+    """The poses of the drive if it has some; else GNSS and IMU smoothed, with the relative poses of its scans.
+
+    Given poses that are measurements (see `matches_scans`) are smoothed with the relative poses, too. `matches` are
+    those along the `first` trajectory.
+    """
+    is_sharp, chosen = False, settings.trajectory
+    if matches is not None:
+        stats.counts.update(matches.counts)
+        # a scan that cannot be used at all is reported when the map is built
+        stats.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
+        is_sharp = matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
+    if log.given is not None:
+        if matches is None:
+            return DriveTrajectory(log.given)
         stddevs = np.radians(chosen.given_stddev_deg), chosen.given_stddev_m
         held = held_by(log.given, matches.relative_poses, stddevs, chosen.drift_correlation_time_s)
         return DriveTrajectory(held, without_lidar=log.given, from_lidar_odometry=is_sharp)
-    found = first if first is not None else smooth_log(log, _plain(settings.trajectory, with_lidar))
-    from_lidar_odometry, without_lidar, sweeps = False, None, None
-    if with_lidar:
-        sweeps = sweeps_along(log, found.trajectory, saved)
-        matches, from_lidar_odometry = _matched(log, found.trajectory, settings, stats, progress, match)
-        if len(matches.relative_poses):
-            without_lidar = found.trajectory
-            found = smooth_log(log, settings.trajectory, matches.relative_poses)
-        elif first is None:
-            found = smooth_log(log, settings.trajectory)
+    relative = None if matches is None or not len(matches.relative_poses) else matches.relative_poses
+    found = smooth_log(log, chosen, relative)
     stats.warnings.extend(found.notes)
-    located = DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry, sweeps=sweeps)
-    return _bound(located, log, settings, stats, registrar_of) if bound else located
+    return DriveTrajectory(found.trajectory, found, None if relative is None else first, is_sharp)
+
+
+def located(log: SensorLog, found: DriveTrajectory, saved: Path | None = None) -> LocatedDrive | None:
+    """What binds a drive where it comes to a place again; None where its trajectory cannot be bound.
+
+    `saved`: the folder of sweeps that were saved when they were matched.
+    """
+    if found.solution is None or found.solution.condensed is None or found.without_lidar is None:
+        return None
+    sweeps = sweeps_along(log, found.without_lidar, saved)
+    return LocatedDrive(log.name, sweeps, found.trajectory, found.solution.condensed)
 
 
 def matches_scans(log: SensorLog, settings: Settings) -> bool:
@@ -116,58 +143,11 @@ def matches_scans(log: SensorLog, settings: Settings) -> bool:
     return is_open and chosen.lidar_odometry and bool(log.scans)
 
 
-def _matched(
-    log: SensorLog,
-    trajectory: Trajectory,
-    settings: Settings,
-    stats: RunStats,
-    progress: Progress,
-    match: Matcher | None,
-) -> tuple[ScanMatches, bool]:
-    """The matches of the scans, and whether nearly all of them have one."""
-    matches = (match or _in_this_process)(log, trajectory, settings, progress)
-    release_memory()  # of the local map
-    stats.counts.update(matches.counts)
-    # a scan that cannot be used at all is reported when the map is built
-    stats.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
-    return matches, matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
-
-
-def _plain(settings: TrajectorySettings, with_lidar: bool) -> TrajectorySettings:
-    """How a drive is smoothed first: before LiDAR odometry, only the motion within a sweep counts."""
-    if not with_lidar:
-        return settings
+def _plain(settings: TrajectorySettings) -> TrajectorySettings:
+    """How a drive is smoothed before LiDAR odometry: only the motion within a sweep counts."""
     return settings.model_copy(
         update={"vehicle_constraint": "off", "estimate_time_offset": False, "forward_backward": False}
     )
-
-
-def _bound(
-    found: DriveTrajectory,
-    log: SensorLog,
-    settings: Settings,
-    stats: RunStats,
-    registrar_of: RegistrarOf | None,
-) -> DriveTrajectory:
-    """The trajectory, bound to itself where it comes to a place again."""
-    if found.solution is None or found.solution.condensed is None or found.sweeps is None:
-        return found
-    release_memory()  # of the graph
-    located = LocatedDrive(log.name, found.sweeps, found.trajectory, found.solution.condensed)
-    registrar = None if registrar_of is None else registrar_of(log, found.trajectory, settings)
-    together = bind_passes([located], settings.trajectory.revisits, registrar=registrar)
-    count_passes(together, stats)
-    solution, correction = replace(found.solution, condensed=None), together.corrections[0]
-    found = replace(found, solution=solution, passes=together.passes)
-    if correction is None:
-        return found
-    return replace(found, trajectory=correction.of(found.trajectory), alone=found.trajectory)
-
-
-def _in_this_process(
-    log: SensorLog, trajectory: Trajectory, settings: Settings, progress: Progress
-) -> ScanMatches:
-    return match_scans(log, trajectory, settings.trajectory.scan_matching, progress)
 
 
 def in_frame(

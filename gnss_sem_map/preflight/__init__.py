@@ -12,8 +12,9 @@ from dataclasses import replace
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.preflight import camera, inertial, lidar_pair, positions, sweeps, wheels
-from gnss_sem_map.preflight.findings import Finding, Preflight
+from gnss_sem_map.preflight.findings import Finding, Level, Preflight, PreflightError
 from gnss_sem_map.preflight.sample import Sample
+from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.process.thread_pools import thread_pool, unless_left
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import SensorLog
@@ -49,3 +50,15 @@ def _on_top(finding: Finding, chosen: SensorConventions) -> Finding:
     return replace(
         finding, remedy=f"{finding.remedy}; this is on top of {' and '.join(named)}, which is set now"
     )
+
+
+def check_drive(
+    log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats, force: bool = False
+) -> Preflight:
+    """The pre-flight check; amber findings, and red ones with `force`, become warnings. Raises PreflightError."""
+    with stats.stage("preflight"):
+        page = check(log, settings, segmenter, with_camera=segmenter is not None)
+    if page.level is Level.RED and not force:
+        raise PreflightError(log.name, page)
+    stats.warnings.extend(str(finding) for finding in (*page.of(Level.RED), *page.of(Level.AMBER)))
+    return page

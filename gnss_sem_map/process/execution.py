@@ -13,7 +13,7 @@ import threading
 import traceback
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol
@@ -38,12 +38,14 @@ _of_thread = threading.local()
 class Task:
     """A call of a module-level function; `name` is for reports, `function` is "package.module:function".
 
-    Arguments are JSON: strings, numbers, booleans, None, lists, and dicts with strings as keys. Raises ConfigError.
+    Arguments are JSON: strings, numbers, booleans, None, lists, and dicts with strings as keys. `size` is how much work
+    it is, for the progress. Raises ConfigError.
     """
 
     name: str
     function: str
     arguments: tuple[Any, ...] = ()
+    size: int = 1
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"\w+(\.\w+)*:\w+", self.function):
@@ -63,13 +65,22 @@ def path_of(function: Callable[..., Any]) -> str:
     return f"{function.__module__}:{function.__name__}"
 
 
-def failure_of(call: Callable[[], object]) -> str:
-    """Make a call, and return why it fails, by an error of ours or of the system; empty when it does not."""
+def report(done: int) -> None:
+    """Tell, within a task, how much of its size is done; who called it in the same process hears it."""
+    getattr(_of_thread, "report", lambda done: None)(done)
+
+
+def attempt(function: str, arguments: list[Any], allowed: str = ALLOWED) -> dict[str, Any]:
+    """Call another task: its `result`, or why it `failed`, by an error of ours or of the system. A task."""
     try:
-        call()
+        return {"result": _function(function, allowed)(*arguments)}
     except (SemMapError, FactorGraphError, OSError) as error:
-        return _told(error)
-    return ""
+        return {"failed": _told(error)}
+
+
+def attempted(task: Task) -> Task:
+    """The task that attempts this one."""
+    return Task(task.name, path_of(attempt), (task.function, list(task.arguments)), task.size)
 
 
 def _told(error: SemMapError | FactorGraphError | OSError) -> str:
@@ -104,16 +115,29 @@ def run_tasks(
 ) -> Generator[tuple[Task, Any]]:
     """Call all tasks, and yield each with its result (JSON) when it is done.
 
-    `progress(done, total)` is called before the first task and after every one. `lost` makes the result of a task that
-    is lost three times; by default it raises GivenUp. Raises what the functions raise of our errors, DataError for an
-    OSError, and RuntimeError for a defect.
+    `progress(done, total)`, in sizes of tasks, is called before the first and after every one. `lost` makes the result
+    of a task that is lost three times; by default it raises GivenUp. Raises what the functions raise of our errors,
+    DataError for an OSError, and RuntimeError for a defect.
     """
-    tasks = list(tasks)
-    progress(0, len(tasks))
-    with closing(executor.run(tasks)) as running:
-        for done, (task, result) in enumerate(running, start=1):
-            progress(done, len(tasks))
+    tasks, done = list(tasks), 0
+    total = sum(task.size for task in tasks)
+    progress(0, total)
+    with closing(executor.run(tasks)) as running, _heard(lambda more: progress(done + more, total)):
+        for task, result in running:
+            done += task.size
+            progress(done, total)
             yield task, lost(result) if isinstance(result, GivenUp) else result
+
+
+@contextmanager
+def _heard(report: Callable[[int], None]) -> Iterator[None]:
+    """What tasks of this process `report` is heard."""
+    before = getattr(_of_thread, "report", None)
+    _of_thread.report = report
+    try:
+        yield
+    finally:
+        _of_thread.report = before or (lambda done: None)
 
 
 @dataclass(frozen=True)
@@ -133,17 +157,20 @@ def call(function: str, arguments: str, allowed: str = ALLOWED) -> str:
 
     Raises ConfigError for a function outside the modules that are allowed.
     """
-    module, _, name = function.partition(":")
-    if not f"{module}.".startswith(allowed):
-        raise ConfigError(f"{function}: may not be called as a task; expected a function of {allowed}*")
-    try:
-        called = getattr(import_module(module), name)
-    except (ModuleNotFoundError, AttributeError) as error:
-        raise ConfigError(
-            f"{function}: no such function ({error}); is another version installed here?"
-        ) from None
+    called = _function(function, allowed)
     with one_blas_thread():
         return json.dumps(called(*json.loads(arguments)))
+
+
+def _function(path: str, allowed: str) -> Callable[..., Any]:
+    module, _, name = path.partition(":")
+    if not f"{module}.".startswith(allowed):
+        raise ConfigError(f"{path}: may not be called as a task; expected a function of {allowed}*")
+    try:
+        found: Callable[..., Any] = getattr(import_module(module), name)
+    except (ModuleNotFoundError, AttributeError) as error:
+        raise ConfigError(f"{path}: no such function ({error}); is another version installed here?") from None
+    return found
 
 
 def answer(function: str, arguments: str, allowed: str = ALLOWED, place: str = "") -> str:

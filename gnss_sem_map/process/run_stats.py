@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from gnss_sem_map.process.machine import most_held_bytes
 from gnss_sem_map.process.memory import release_memory
@@ -34,6 +35,28 @@ class RunStats:
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory_mb: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> RunStats:
+        """Those that `as_dict` made."""
+        return cls(**{
+            **content, "counts": Counter(content["counts"]), "skips": [Skip(**skip) for skip in content["skips"]]
+        })  # fmt: skip
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has them."""
+        return asdict(self) | {"counts": dict(self.counts)}
+
+    def __iadd__(self, later: RunStats) -> RunStats:
+        """With those of a later part of the run."""
+        self.counts.update(later.counts)
+        self.skips += later.skips
+        self.warnings += later.warnings
+        for name, seconds in later.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        for name, peak in later.peak_memory_mb.items():
+            self.peak_memory_mb[name] = max(self.peak_memory_mb.get(name, 0.0), peak)
+        return self
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, astuple, replace
+from dataclasses import asdict, astuple
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,30 +16,10 @@ from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED
 from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.refinement.steps import RefinementReport
-from gnss_sem_map.runs.pipeline import Mapped
-from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.voxels import tiles
 
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
-
-
-def about_mapped(source: Source, mapped: Mapped) -> dict[str, Any]:
-    """What is known of a drive beside its map, for run.json."""
-    scans = mapped.log.scans
-    return about_run(source.name, mapped.log, mapped.stats) | {
-        "inputs": source.inputs,
-        "scans_s": [scans[0].stamp, scans[-1].stamp],
-        "preflight": mapped.preflight.as_dict(),
-        "trajectory": about_solution(mapped.solution),
-        "from_lidar_odometry": mapped.from_lidar_odometry,
-        "passes": [asdict(row) for row in mapped.passes],
-    }
-
-
-def metrics_of(mapped: Mapped) -> dict[str, Any]:
-    """Figures of a drive that need no truth, for metrics.json."""
-    return {"sharpness": {name: figures.as_dict() for name, figures in mapped.sharpness.items()}}
 
 
 def about_run(drive: str, log: SensorLog, stats: RunStats) -> dict[str, Any]:
@@ -98,11 +78,6 @@ def about_map(folder: Path, report: RefinementReport) -> dict[str, Any]:
         },
         "refinement": _about_refinement(report),
     }
-
-
-def with_objects(report: RefinementReport, mapped: Mapped) -> RefinementReport:
-    """The report of a refinement, with the objects that were found while the drive was mapped."""
-    return replace(report, tracked=mapped.objects, untracked=mapped.untracked)
 
 
 def about_solution(solution: Solution | None) -> dict[str, Any] | None:

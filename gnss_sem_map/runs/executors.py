@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.process.dask_cluster import Cluster
+from gnss_sem_map.process.execution import Executor, InProcess
 from gnss_sem_map.process.worker_processes import Processes
 
 LONGEST_TASK_S = 86_400.0
@@ -18,8 +19,8 @@ LONGEST_TASK_S = 86_400.0
 @contextmanager
 def executor_of(
     workers: int, scheduler: str | None, work: Path, reads: Iterable[Path | str | None]
-) -> Iterator[Processes | Cluster | None]:
-    """Processes, or the workers of the Dask scheduler at an address; None for this process.
+) -> Iterator[Executor]:
+    """Processes, or the workers of the Dask scheduler at an address; else this process.
 
     `work` is the work folder of the run, and it `reads` these inputs; what is not there is told later. Raises
     ConfigError and DataError for a cluster that cannot do the tasks.
@@ -36,4 +37,4 @@ def executor_of(
         with closing(Processes(workers, timeout_s=LONGEST_TASK_S, keep=True)) as processes:
             yield processes
     else:
-        yield None
+        yield InProcess()

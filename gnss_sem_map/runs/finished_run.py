@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -40,27 +40,28 @@ from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.classifying import OFF
-from gnss_sem_map.mapping.fusion import without_images
+from gnss_sem_map.mapping.fusion import map_scans, without_images
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import pipeline, run_folder
-from gnss_sem_map.runs.about import about_map, about_skips, with_objects
-from gnss_sem_map.runs.chunk_tasks import ChunkTasks
+from gnss_sem_map.runs.about import about_map, about_skips
+from gnss_sem_map.runs.delivery import write_summary
+from gnss_sem_map.runs.drive_job import closing_drives, give, job_for
+from gnss_sem_map.runs.drive_tasks import write_map
 from gnss_sem_map.runs.executors import executor_of
-from gnss_sem_map.runs.match_tasks import SavedMatches
+from gnss_sem_map.runs.many_drives import begin
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.runs.point_label_files import (
     LABELS,
     RAW_LABELS,
     LabelledDrive,
     write_point_labels,
 )
-from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.run_settings import SETTINGS, differing, read_settings, write_settings
 from gnss_sem_map.runs.same_run import digest_of, is_run_of
 from gnss_sem_map.runs.source import Source, absolute, source_of
 from gnss_sem_map.runs.tracks import tracks_of
-from gnss_sem_map.runs.written_drives import write_summary
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.classes import unknown_classes
 from gnss_sem_map.sensor_log import SensorLog, Skip
@@ -111,22 +112,14 @@ def run(
             with suppress(OSError):  # it was killed while it cleaned up
                 work_folder.clear(claim.work)
             return Run(out)
-        network = source.open_network(settings, log)
-        with new_folder(out) as folder:
-            with executor_of(workers, scheduler, claim.work, places) as executor:
-                match = SavedMatches(source, claim.work, executor, resume)
-                register = None if executor is None else RevisitTasks(source, claim.work, executor)
-                elsewhere = None if executor is None else ChunkTasks(source, executor)
-                mapped = pipeline.run(
-                    log, network, settings, folder, claim.work, progress,
-                    origin=origin, resume=resume, match=match, registrar_of=register, elsewhere=elsewhere,
-                    labels_from=source.labels_from, force=force,
-                    write=partial(run_folder.write_trajectory_files, folder, delivery=settings.delivery),
-                )  # fmt: skip
-                refined = pipeline.refine(
-                    folder, settings, mapped.stats, progress, executor=executor, work=claim.work
-                )
-            run_folder.write_run(folder, source, mapped, refined, settings, read, write_labels, progress)
+        begin(claim.work, resume)
+        with executor_of(workers, scheduler, claim.work, places) as executor:
+            making = MapJob(settings, origin or log.frame, claim.work, executor, progress, True)
+            job = job_for(source, making, force)
+            with closing_drives():
+                give(job, log)
+                pipeline.bound_and_mapped([job], making)
+            pipeline.write_one(out, job, making, write_labels)
     return Run(out)
 
 
@@ -255,12 +248,13 @@ class Run:
                 stats.warnings.append(f"{spec}: {unknown}")
             drive = Drive(log, run.trajectory, network, settings)
             with TemporaryDirectory(prefix=".work.", dir=folder) as work:
-                mapped = pipeline.map_drive(
-                    drive, folder, Path(work) / "work", stats, progress, labels_from=spec
-                )
+                with stats.stage("mapping"):
+                    store = map_scans(drive, Path(work) / "work", stats, progress, labels_from=spec)
+                    write_map(drive, store, folder, stats)
+                objects, untracked = store.objects(), store.untracked()
             refined = pipeline.refine(folder, settings, stats, progress)
-            refined = replace(refined, report=with_objects(refined.report, mapped))
-            run_folder.write_objects(folder, str(before["drive"]), mapped, settings)
+            refined = replace(refined, report=replace(refined.report, tracked=objects, untracked=untracked))
+            run_folder.write_objects(folder, str(before["drive"]), log, objects, settings)
             skips = [Skip(**skip) for skip in before["skips"]["listed"] if skip["what"] != "labels"]
             changed = {
                 "inputs": before["inputs"] | {"segmenter": spec},

@@ -1,7 +1,4 @@
-"""Many drives, one map: each drive is mapped into a folder of its own, in the frame of all, and the maps are added.
-
-Drives that pass the same places are bound first (`bound_drives`); then every drive is mapped, each as a task
-(`drive_tasks`), and the map of all is written (`written_drives`).
+"""Maps of several drives: what makes or changes one prepares the folder, and calls the stages of the `pipeline`.
 
 Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once:
 drives that it was bound to are mapped again, the others stay.
@@ -11,12 +8,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
@@ -26,31 +21,25 @@ from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.files.output_folder import Claim, refuse_locked
+from gnss_sem_map.files.output_folder import Claim
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES, REMOVED
 from gnss_sem_map.mapping.raw_map import MAP
-from gnss_sem_map.mapping.trajectory import check_georeference
-from gnss_sem_map.process.execution import InProcess
 from gnss_sem_map.process.run_stats import Progress, silent
-from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.bound_drives import BoundDrives, KnownTrack, bind_drives, read_correction
-from gnss_sem_map.runs.drive_tasks import failed_before, map_all, save_failed
+from gnss_sem_map.runs import pipeline, run_folder
+from gnss_sem_map.runs.binding import bind, groups_near, refuse_unbindable, with_unheld
+from gnss_sem_map.runs.drive_job import closing_drives, job_for
 from gnss_sem_map.runs.executors import executor_of
+from gnss_sem_map.runs.map_job import MapJob
+from gnss_sem_map.runs.pipeline import write_drives
 from gnss_sem_map.runs.run_settings import read_settings
 from gnss_sem_map.runs.same_run import is_map_of
-from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
-from gnss_sem_map.runs.written_drives import write_drives
 from gnss_sem_map.scans.base_cloud import BaseCloud
-from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.reuse import read_record, write_record
-
-LONGEST_GAP_S = 3.0
-"""In a longer gap of its fixes a drive may pass a place that is `bound_drives.NEAR_M` from all of them."""
 
 
 @dataclass(frozen=True)
@@ -101,53 +90,28 @@ def run_drives(
 
     `align_to` is a georeferenced LAS or LAZ, which stands: the drives are held onto it.
 
-    Drives are shared among `workers` processes, or the workers of the Dask scheduler at the address `scheduler`.
-    A drive that fails, or whose worker dies three times, is left out, and named in run.json. Raises DataError when all
-    fail, when two drives have one name or are the same, or the first has no georeference.
+    The tasks of all drives are shared among `workers` processes, or the workers of the Dask scheduler at the address
+    `scheduler`. A drive that fails, or whose worker dies three times, is left out, and named in run.json. Raises
+    DataError when all fail, when two drives have one name or are the same, or the first has no georeference.
     """
     drives = [_absolute(drive) for drive in drives]
     sources = [how.source(drive) for drive in drives]
     frame = frame_of_all(sources, settings, origin)
     places = run_folder.places_read(sources, settings)
-    with ExitStack() as held:
-        claim = held.enter_context(run_folder.claimed_run(out, [*places, align_to], is_resumable=True))
+    with run_folder.claimed_run(out, [*places, align_to], is_resumable=True) as claim:
         if how.resume and align_to is None and is_map_of(out, sources, settings, frame, write_labels):
             return _finished_before(claim)
-        executor = held.enter_context(executor_of(workers, scheduler, claim.work, places))
-        run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
-        _begin(run, how.resume)
-        base = None if align_to is None else read_base(align_to, frame, settings.delivery.geoid)
-        bound, failed = _bound_and_mapped(sources, how.force, run, base)
-        names = [drive.name for drive in drives if drive.name not in failed]
-        done = {name: claim.work / DRIVES / name for name in names}
-        if not done:
-            raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
-        labelled = [source for source in sources if source.name in done and write_labels]
-        about = write_drives(out, done, failed, bound, run, labelled, align_to)
-    return ManyDrives(out, about)
-
-
-def _bound_and_mapped(
-    sources: Sequence[Source], force: bool, run: SeveralDrives, base: BaseCloud | None
-) -> tuple[BoundDrives, dict[str, str]]:
-    """Bind the drives and map them; name -> reason of those that fail.
-
-    One that fails may be wrong, and is not in the map: then those that it moved are bound without it, and mapped again.
-    """
-    tracks, before = _tracks(sources, run.frame, run.settings), failed_before(run)
-    failed: dict[str, str] = {}
-    while True:
-        stay = [source for source in sources if source.name not in failed]
-        bound = bind_drives(stay, {name: tracks[name] for name in tracks.keys() - failed}, run, base, force)
-        # first those that failed before an interruption: the others may be done without them
-        first = [source for source in stay if source.name in before]
-        failing = map_all(first, bound, force, run)
-        if failing.keys().isdisjoint(bound.corrections):
-            failing |= map_all([source for source in stay if source not in first], bound, force, run)
-        failed |= failing
-        save_failed(failed, run)
-        if failing.keys().isdisjoint(bound.corrections):
-            return bound, failed
+        begin(claim.work, how.resume)
+        with executor_of(workers, scheduler, claim.work, places) as executor:
+            run = MapJob(settings, frame, claim.work, executor, progress)
+            base = _base(align_to, run)
+            jobs = [job_for(source, run, force=how.force) for source in sources]
+            with closing_drives():
+                bound, made = pipeline.bound_and_mapped(jobs, run, base, how.force)
+            if not made:
+                raise DataError(f"{out}: no drive could be mapped; {_first(run.failed)}")
+            labelled = [source for source in sources if source.name in made and write_labels]
+            return ManyDrives(out, write_drives(out, made, bound, run, labelled, align_to))
 
 
 def frame_of_all(sources: Sequence[Source], settings: Settings, origin: LocalFrame | None) -> LocalFrame:
@@ -180,9 +144,9 @@ def add_drive(
             return _finished_before(claim)
         known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
         _check_distinct([*known, (drive.name, drive)])
+        begin(claim.work, how.resume)
         with executor_of(workers, scheduler, claim.work, _places_read(there, added, settings)) as executor:
-            run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
-            _begin(run, how.resume)
+            run = MapJob(settings, frame, claim.work, executor, progress)
             return ManyDrives(out, _changed(out, there, added, how.force, run))
 
 
@@ -221,10 +185,10 @@ def remove_drive(
             raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
         if not stay:
             raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
+        begin(claim.work, resume)
+        write_record({"name": name}, claim.work / REMOVED)
         with executor_of(workers, scheduler, claim.work, _places_read(stay, [], settings)) as executor:
-            run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
-            _begin(run, resume)
-            write_record({"name": name}, claim.work / REMOVED)
+            run = MapJob(settings, frame, claim.work, executor, progress)
             return ManyDrives(out, _changed(out, stay, [], True, run))
 
 
@@ -233,31 +197,47 @@ def _changed(
     there: Mapping[str, Path],
     added: Sequence[Source],
     force: bool,
-    run: SeveralDrives,
+    run: MapJob,
 ) -> dict[str, Any]:
     """Write the map of drives that were mapped before and of new ones; what is bound in another way is mapped again."""
     aligned_to = read_run(out).get("aligned_to")
     align_to = None if aligned_to is None else Path(aligned_to)
-    base = None if align_to is None else read_base(align_to, run.frame, run.settings.delivery.geoid)
-    tracks = {name: _driven(folder) for name, folder in there.items()}
-    tracks |= _tracks(added, run.frame, run.settings)
-    known = [_source_of(name, folder) for name, folder in there.items()]
-    bound = bind_drives([*known, *added], tracks, run, base, force)
-    for name in there:
-        if name in bound.failed:
+    base, before = _base(align_to, run), {name: _correction_of(folder) for name, folder in there.items()}
+    with closing_drives():
+        drives, read = pipeline.locate_drives([job_for(source, run, force=force) for source in added], run)
+        _refuse_failed(out, run)
+        tracks = {name: tracks_of(folder)[0].positions for name, folder in there.items()}
+        tracks |= {name: one.track() for name, one in drives.items()}
+        near = {name for group in groups_near(tracks, run, base) for name in group}
+        again = [_source_of(name, folder) for name, folder in there.items() if name in near or before[name]]
+        known, known_read = pipeline.locate_drives([job_for(one, run, force=True) for one in again], run)
+        for name, reason in run.failed.items():
             raise DataError(
                 f"{out}: stays as it was; {name} passes the same places, and would have to be bound and mapped again:"
-                f" {bound.failed[name]}; put it back, or make a map with trajectory.revisits.enabled=false"
+                f" {reason}; put it back, or make a map with trajectory.revisits.enabled=false"
             )
-    moved = [
-        source for source in known
-        if _correction_of(there[source.name]) != read_correction(str(bound.corrections.get(source.name, "")))[1]
-    ]  # fmt: skip
-    failed = map_all([*moved, *added], bound, force, run)
-    if failed:
-        raise DataError(f"{out}: stays as it was; {_first(failed)}")
-    new = {source.name: run.work / DRIVES / source.name for source in (*moved, *added)}
-    return write_drives(out, {**there, **new}, {}, bound, run, align_to=align_to)
+        tracks |= {name: one.track() for name, one in known.items()}
+        bound = bind({**known, **drives}, tracks, run, base)
+        if base is not None:
+            bound = with_unheld(tracks, bound, base, force)
+        moved = {name: one for name, one in known.items() if before[name] != bound.held.get(name, "")}
+        new = pipeline.map_drives({**moved, **drives}, {**known_read, **read}, bound, run)
+    _refuse_failed(out, run)
+    return write_drives(out, {**there, **new}, bound, run, align_to=align_to)
+
+
+def _refuse_failed(out: Path, run: MapJob) -> None:
+    if run.failed:
+        raise DataError(f"{out}: stays as it was; {_first(run.failed)}")
+
+
+def _base(align_to: Path | None, run: MapJob) -> BaseCloud | None:
+    """The cloud that stands; raises DataError, also where nothing can be held onto it."""
+    if align_to is None or run.frame is None:
+        return None
+    base = read_base(align_to, run.frame, run.settings.delivery.geoid)
+    refuse_unbindable(base, run)
+    return base
 
 
 def _source_of(name: str, folder: Path) -> Source:
@@ -278,47 +258,15 @@ def _correction_of(folder: Path) -> str:
     return str(read_run(folder).get("correction", ""))
 
 
-def _driven(folder: Path) -> KnownTrack:
-    """The track of a drive that was mapped."""
-    return KnownTrack(tracks_of(folder)[0].positions)
-
-
-def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) -> dict[str, KnownTrack]:
-    """The GNSS track of each drive that has one in this frame; of the others, their task says why."""
-    found = {}
-    for source in sources:
-        try:
-            log = source.open_log(with_imu=False)
-            check_georeference(log, frame, settings.mapping.voxel_size_m)
-        except (SemMapError, FactorGraphError, OSError):
-            continue
-        if log.gnss is None or log.frame is None or not len(log.gnss):
-            continue
-        T = frame.pose_of(log.frame)
-        found[source.name] = KnownTrack(log.gnss.positions @ T[:3, :3].T + T[:3, 3], _has_gaps(log))
-    return found
-
-
-def _has_gaps(log: SensorLog) -> bool:
-    """Whether a drive had no fix for so long, while it had scans, that it may have been somewhere else."""
-    if log.gnss is None or not log.scans:
-        return False
-    first, last, fixes = log.scans[0].stamp, log.scans[-1].stamp, log.gnss.stamps
-    known = np.concatenate([[first], fixes[(fixes > first) & (fixes < last)], [last]])
-    return bool(np.diff(known).max() > LONGEST_GAP_S)
-
-
-def _begin(run: SeveralDrives, resume: bool) -> None:
-    """Prepare the work folder, with the settings for tasks; raises DataError."""
-    with work_folder.writing_to(run.work):
+def begin(work: Path, resume: bool) -> None:
+    """Prepare the work folder of a map; raises DataError."""
+    with work_folder.writing_to(work):
         if not resume:
-            refuse_locked(run.work / DRIVES)
-            work_folder.remove_drives(run.work)
-        (run.work / REMOVED).unlink(missing_ok=True)
-        work_folder.make(run.work)
-        (run.work / DRIVES).mkdir(exist_ok=True)
-        work_folder.remove_damaged_drives(run.work)
-        run.write_settings()
+            work_folder.remove_drives(work)
+        (work / REMOVED).unlink(missing_ok=True)
+        work_folder.make(work)
+        (work / DRIVES).mkdir(exist_ok=True)
+        work_folder.remove_damaged_drives(work)
 
 
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:

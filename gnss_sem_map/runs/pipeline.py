@@ -1,278 +1,240 @@
-"""The stages of a run: from a drive to its trajectory and its semantic map (Fig. 1 of the paper).
+"""From logs to a map (Fig. 1 of the paper): one drive is a map of one.
 
-    preflight           check the log against physics, and its sensors against each other; a probable mistake stops
-    trajectory          smooth GNSS and IMU in batch (or take the poses of the drive), then add LiDAR odometry, and
-                        bind places that are passed again
-    sharpness           measure the thickness of surfaces under the trajectories
-    mapping             every scan once: deskew, label from its image, fuse into the voxels, find what moved
-    refinement          the steps of `refinement.steps`, block by block
+    check       every log against physics, and its sensors against each other; a probable mistake stops
+    match       LiDAR odometry, a section of the scans at a time
+    locate      GNSS, IMU and odometry smoothed in batch, or the poses of the drive
+    bind        places that are passed again, by the same drive or by another one
+    place       every trajectory in the frame of the map, and how sharp a map it makes
+    map         every scan once: deskew, label from its image, fuse into the voxels, find what moved
+    add         the maps of all drives, tile by tile
+    refine      the steps of `refinement.steps`, block by block
+    deliver     files for the next tool, report, run.json
 
-Maps are written into a folder, tile by tile. The other files of a run are written by `runs`, with `export`.
+Every stage is a flat list of tasks, of all drives, on whatever calls them: this process, others, a cluster. What a task
+finds is remembered with the digest of what it was made from (`files.memo`, and tiles with their records): resuming,
+adding and taking out a drive, and refining again, are doing what is not there yet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
+from typing import Any
 
-from factor_graphs.corrections import Correction
-from factor_graphs.geodesy import LocalFrame
-from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import preflight
 from gnss_sem_map.config import Settings
-from gnss_sem_map.dynamics.motion_state import TrackedObject
-from gnss_sem_map.evaluation.map_sharpness import Sharpness, SweepSample, of_sample
-from gnss_sem_map.files.work_folder import SWEEPS
+from gnss_sem_map.files.output_folder import new_folder
+from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.files.work_folder import remove_chunks, remove_sweeps, writing_to
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.classifying import fit_classifiers, opened_model
-from gnss_sem_map.mapping.fusion import Elsewhere, map_scans
-from gnss_sem_map.mapping.labelled_scans import Drive, pattern_sweeps
-from gnss_sem_map.mapping.passes import TwoPasses
-from gnss_sem_map.mapping.raw_map import open_raw, write_raw
-from gnss_sem_map.mapping.refining import Refined, opened_sensor_model, refine_map
-from gnss_sem_map.mapping.trajectory import (
-    DriveTrajectory,
-    Matcher,
-    RegistrarOf,
-    check_georeference,
-    check_heights,
-    estimate_trajectory,
-    in_frame,
-    locate,
-    matches_scans,
-)
-from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError
+from gnss_sem_map.mapping import fusion
+from gnss_sem_map.mapping.classifying import fit_classifiers
+from gnss_sem_map.mapping.raw_map import open_raw, write_sum
+from gnss_sem_map.mapping.refining import Refined, refine_map
+from gnss_sem_map.mapping.trajectory import estimate_trajectory, in_frame, locate
+from gnss_sem_map.preflight import check_drive
+from gnss_sem_map.process.dask_cluster import Cluster
 from gnss_sem_map.process.execution import Executor
-from gnss_sem_map.process.machine import one_blas_thread
-from gnss_sem_map.process.memory import release_memory
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
-from gnss_sem_map.scans.kept_sweeps import KeptSweeps
+from gnss_sem_map.process.worker_processes import Processes
+from gnss_sem_map.runs import drive_tasks
+from gnss_sem_map.runs.binding import BoundDrives, LocatedJob, bind, with_unheld
+from gnss_sem_map.runs.delivery import RefinedMap, deliver_drives, deliver_one, link_drives, link_map
+from gnss_sem_map.runs.drive_job import DriveJob, closing_drives, give, job_for, opened
+from gnss_sem_map.runs.map_job import MapJob, task_of
+from gnss_sem_map.runs.source import Source
+from gnss_sem_map.scans.base_cloud import BaseCloud
+from gnss_sem_map.scans.lidar_odometry import sections_of
 from gnss_sem_map.segmentation import Segmenter
-from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabilities_folder
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log import SensorLog, Skip
 
 __all__ = [
-    "Located",
-    "Mapped",
     "check_drive",
     "estimate_trajectory",
     "in_frame",
     "locate",
-    "map_drive",
+    "locate_drives",
+    "map_drives",
     "refine",
-    "run",
-    "saving_sweeps",
 ]
 
+DRIVES_AT_ONCE = 16
+"""Chunks of so many drives are on disk at a time."""
+CHUNKS_ON_CLUSTER = 4
+"""Chunks of a task on a cluster, whose workers come and go."""
+
+
+def locate_drives(drives: Sequence[DriveJob], run: MapJob) -> tuple[dict[str, LocatedJob], dict[str, str]]:
+    """The trajectory of every drive, in its own frame: check, match, locate; and the digest of all that was read."""
+    jobs = {job.name: job.begin() for job in drives}
+    check = {name: [task_of(name, drive_tasks.check, *job.key)] for name, job in jobs.items()}
+    checked = {name: found for name, [found] in run.call("preflight", check).items()}
+    match = {
+        name: [
+            task_of(
+                f"{name}, section {n} of its scans",
+                drive_tasks.match, *jobs[name].key, found["matches"], n, size=len(section),
+            )
+            for n, section in enumerate(sections_of(found["scans"], run.settings.trajectory.scan_matching))
+            if found["matches"] is not None
+        ]
+        for name, found in checked.items()
+    }  # fmt: skip
+    locate = {
+        name: [task_of(name, drive_tasks.locate, *jobs[name].key, checked[name]["matches"])]
+        for name in run.call("scan matching", match)
+    }
+    located = {
+        name: LocatedJob(jobs[name], checked[name]["matches"], key)
+        for name, [key] in run.call("trajectory", locate).items()
+    }
+    return located, {name: checked[name]["read"] for name in located}
+
+
+def map_drives(
+    drives: Mapping[str, LocatedJob], read: Mapping[str, str], bound: BoundDrives, run: MapJob
+) -> dict[str, Path]:
+    """The folder of the map of every located drive: place, map, finish. `read`: digest of all that was read of each."""
+    names = [
+        name for name, one in drives.items() if not one.job.is_made(read[name], bound.held.get(name, ""))
+    ]
+    made = {name: one.job.made for name, one in drives.items() if name not in names}
+    for start in range(0, len(names), DRIVES_AT_ONCE):
+        some = {name: drives[name] for name in names[start : start + DRIVES_AT_ONCE]}
+        for name in _mapped(some, bound, run):
+            made[name] = drives[name].job.made
+            with writing_to(run.work):
+                remove_chunks(drives[name].job.folder)
+                remove_sweeps(drives[name].job.folder)
+    return made
+
+
+def _mapped(drives: Mapping[str, LocatedJob], bound: BoundDrives, run: MapJob) -> list[str]:
+    """Names of the drives whose map is written."""
+    place = {
+        name: [task_of(name, drive_tasks.place, *one.job.key, one.located, bound.keys[name])]
+        for name, one in drives.items()
+    }
+    placed = {name: found for name, [found] in run.call("sharpness", place).items()}
+    stores = {
+        name: fusion.store_of(drives[name].job.folder, found["map"], len(found["chunks"]), run.settings)
+        for name, found in placed.items()
+    }
+    for store in stores.values():
+        store.begun(resume=run.is_one or store.is_begun())
+    length = _chunks_per_task(sum(store.count for store in stores.values()), run.executor)
+    chunks = {
+        name: [
+            task_of(
+                f"{name}, chunks {numbers.start} to {numbers.stop - 1}",
+                drive_tasks.map_range, *drives[name].job.key, store.fingerprint, numbers.start, numbers.stop,
+                size=sum(placed[name]["chunks"][numbers.start : numbers.stop]),
+            )
+            for numbers in fusion.ranges(store.pending(), length)
+        ]
+        for name, store in stores.items()
+    }  # fmt: skip
+    finish = {
+        name: [
+            task_of(
+                name, drive_tasks.finish, *drives[name].job.key,
+                {"located": drives[name].located, "bound": bound.keys[name], "mapped": placed[name]["map"]},
+                sum(seconds),
+            )
+        ]
+        for name, seconds in run.call("mapping", chunks).items()
+    }  # fmt: skip
+    return list(run.call("writing", finish))
+
+
+def _chunks_per_task(chunks: int, executor: Executor) -> int:
+    """Chunks of a task. Fewer end more evenly, but each task looks at a window of scans before it as well."""
+    if isinstance(executor, Cluster):
+        return CHUNKS_ON_CLUSTER
+    return max(ceil(chunks / executor.workers), 1) if isinstance(executor, Processes) else max(chunks, 1)
+
+
+def bound_and_mapped(
+    drives: Sequence[DriveJob], run: MapJob, base: BaseCloud | None = None, force: bool = False
+) -> tuple[BoundDrives, dict[str, Path]]:
+    """Locate, bind and map new drives; the folder of the map of each that does not fail.
+
+    One that fails may be wrong, and is not in the map: then those that it moved are bound without it, and mapped again.
+    """
+    located, read = locate_drives(drives, run)
+    while True:
+        tracks = {name: one.track() for name, one in located.items()}
+        bound = bind(located, tracks, run, base)
+        if base is not None:
+            bound = with_unheld(tracks, bound, base, force)
+        made = map_drives(located, read, bound, run)
+        if bound.held.keys() <= made.keys():
+            return bound, made
+        located = {name: one for name, one in located.items() if name in made}
+
+
+def write_one(out: Path, job: DriveJob, run: MapJob, write_labels: bool = False) -> None:
+    """Refine and deliver the map of one drive, which is mapped, into `out`."""
+    with new_folder(out) as folder:
+        link_map(job.made, folder)
+        deliver_one(_refined(folder, run, RunStats()), job, run, write_labels)
+
+
+def write_drives(
+    out: Path,
+    drives: Mapping[str, Path],
+    bound: BoundDrives,
+    run: MapJob,
+    labelled: Sequence[Source] = (),
+    align_to: Path | None = None,
+) -> dict[str, Any]:
+    """Add, refine and deliver the maps of several `drives`, name -> folder, into `out`.
+
+    With point labels of those that are `labelled`. Returns the content of run.json.
+    """
+    stats, classes = RunStats(), run.settings.classes
+    assert run.frame is not None
+    with new_folder(out) as folder:
+        parts = link_drives(drives, folder)
+        with stats.stage("mapping"):
+            write_sum(parts, folder, run.frame, classes, out, executor=run.executor, work=run.work)
+        # tiles that are taken from an earlier map do not say which points of kerbs are which
+        made = _refined(folder, run, stats, None if labelled else out)
+        return deliver_drives(made, bound, run, labelled, align_to)
+
+
+def _refined(folder: Path, run: MapJob, stats: RunStats, earlier: Path | None = None) -> RefinedMap:
+    refined = refine(folder, run.settings, stats, run.progress, earlier, executor=run.executor, work=run.work)
+    return RefinedMap(folder, refined, stats)
+
 
 @dataclass(frozen=True, eq=False)
-class Located:
-    """A drive and its trajectory, in the frame of the map."""
+class MappedLog:
+    """A drive that is mapped: the folder of its map, its log and trajectory there, and what is known of the run."""
 
+    folder: Path
     log: SensorLog
-    trajectory: Trajectory
-    solution: Solution | None = None
-    """Solution of the smoother, in the drive's own frame; None if the drive has poses."""
-    alone: Trajectory | None = None
-    """The trajectory before the drive was bound, to others or to itself; None where nothing binds it."""
-
-    def in_short(self) -> Located:
-        """What is needed to map it: no covariances, and nothing else that grows with the IMU stamps."""
-        solution = None if self.solution is None else self.solution.in_short()
-        return Located(self.log, replace(self.trajectory, covariances=None), solution)
-
-
-@dataclass(frozen=True, eq=False)
-class Mapped:
-    """What is known of a drive beside its raw map and its evidence, which are in its folder."""
-
-    log: SensorLog
-    """In the frame of the map."""
     trajectory: Trajectory
     stats: RunStats
-    objects: tuple[TrackedObject, ...] = ()
-    """Objects through time, with the evidence of their motion."""
-    untracked: int = 0
-    """Objects that had too few points to be tracked."""
-    solution: Solution | None = None
-    """As `Located` has it."""
-    passes: tuple[TwoPasses, ...] = ()
-    """What the drive passed again."""
-    sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
-    """Of the "map"; with LiDAR odometry, also with the poses of "gnss and imu" alone, or "given poses"."""
-    from_lidar_odometry: bool = False
-    """Whether the poses come from LiDAR odometry, so that static objects are not blurred in the map."""
-    preflight: Preflight = field(default_factory=lambda: Preflight((), 0.0))
-    """Findings of the pre-flight check."""
 
 
-@one_blas_thread()
-def run(
-    log: SensorLog,
-    segmenter: Segmenter | None,
-    settings: Settings,
-    folder: Path,
-    work: Path,
-    progress: Progress = silent,
-    *,
-    origin: LocalFrame | None = None,
-    resume: bool = False,
-    match: Matcher | None = None,
-    registrar_of: RegistrarOf | None = None,
-    elsewhere: Elsewhere | None = None,
-    labels_from: str = "",
-    force: bool = False,
-    correction: Correction | None = None,
-    write: Callable[[Located], None] | None = None,
-) -> Mapped:
-    """Trajectory of one drive; its raw map and evidence are written into `folder`.
-
-    Without a segmenter, or without images, the map has no labels. The frame of the map is that of the drive, or
-    `origin`. Intermediate results are kept in the folder `work` until the caller removes it, and used with `resume`;
-    for this and `elsewhere` see `mapping.fusion.map_scans`, for `match` and `registrar_of`
-    `mapping.trajectory.locate`. With `force`, a red pre-flight does not stop the run. `correction`: how the trajectory
-    moves in the frame `origin` because the drive is bound to others; without one, the drive is bound to itself only.
-    `write` gets the trajectory before anything is mapped, and what the map does not need of it is not held any longer.
-    Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
-    """
-    log.check_scans()
-    log = log.in_our_conventions(settings.sensors)
-    check_georeference(log, origin, settings.mapping.voxel_size_m)
-    stats = RunStats(skips=list(log.skips))
-    opened_sensor_model(settings)  # one of other classes is refused now
-    opened_model(settings)
-    saved = work / SWEEPS if match is not None and matches_scans(log, settings) else None
-    page, found, sharpness = _checked_and_located(
-        log, segmenter, settings, stats, progress, force, match, registrar_of, saved, bound=correction is None
+def map_log(
+    log: SensorLog, segmenter: Segmenter | None, run: MapJob, labels_from: str = "", force: bool = False
+) -> MappedLog:
+    """Map a log that is open, with a segmenter that is open, as a map of one; see `drive_tasks.finish`."""
+    job = job_for(Source(log.name, labels_from, called=Path(log.name).name), run, force)
+    with closing_drives():
+        give(job, log, segmenter)
+        bound_and_mapped([job], run)
+        log = opened(*job.key).log
+    about = read_run(job.made)
+    stats = RunStats(
+        Counter(about["counts"]), [Skip(**skip) for skip in about["skips"]["listed"]], about["warnings"]
     )
-    located = _in_map(log, found, origin, correction)
-    check_heights(log.name, located.trajectory, settings.mapping.voxel_size_m)
-    passes, from_lidar_odometry = found.passes, found.from_lidar_odometry
-    del found
-    if write is not None:
-        with stats.stage("export"):
-            write(located)
-        located = located.in_short()
-    release_memory(always=True)  # of graph and local map: holes too small for the arrays of scans
-    drive = Drive(located.log, located.trajectory, segmenter, settings, saved)
-    mapped = map_drive(
-        drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
-    )
-    return replace(
-        mapped,
-        solution=located.solution,
-        passes=passes,
-        sharpness=sharpness,
-        from_lidar_odometry=from_lidar_odometry,
-        preflight=page,
-    )
-
-
-def _in_map(
-    log: SensorLog, found: DriveTrajectory, origin: LocalFrame | None, correction: Correction | None
-) -> Located:
-    """The trajectory that was found, in the frame of the map, and as the drive is bound to others."""
-    alone = None if found.alone is None else in_frame(log, found.alone, origin)[1]
-    log, trajectory = in_frame(log, found.trajectory, origin)
-    if correction is not None:
-        alone, trajectory = trajectory, correction.of(trajectory)
-    return Located(log, trajectory, found.solution, alone)
-
-
-def _checked_and_located(
-    log: SensorLog,
-    segmenter: Segmenter | None,
-    settings: Settings,
-    stats: RunStats,
-    progress: Progress,
-    force: bool,
-    match: Matcher | None,
-    registrar_of: RegistrarOf | None,
-    saved: Path | None,
-    bound: bool,
-) -> tuple[Preflight, DriveTrajectory, dict[str, Sharpness]]:
-    """All that comes before the map; the sweeps that the check has read are not read again."""
-    sweeps = KeptSweeps()
-    progress("preflight", 0, 1)
-    page = check_drive(sweeps.keeping(log), segmenter, settings, stats, force)
-    progress("preflight", 1, 1)
-    found, sharpness = _located(
-        sweeps.taking(log), settings, stats, progress, page.solution, match, registrar_of, saved, bound
-    )
-    if found.solution is not None and (said := page.other_clock(found.solution.calibration.time_offset_s)):
-        stats.warnings.append(said)
-    sweeps.forget()  # sections that are tasks have read their own: 35 MB
-    return replace(page, solution=None), found, sharpness
-
-
-def _located(
-    log: SensorLog,
-    settings: Settings,
-    stats: RunStats,
-    progress: Progress,
-    first: Solution | None,
-    match: Matcher | None,
-    registrar_of: RegistrarOf | None,
-    saved: Path | None,
-    bound: bool,
-) -> tuple[DriveTrajectory, dict[str, Sharpness]]:
-    """The trajectory of a drive, and how sharp a map it makes."""
-    with stats.stage("trajectory"):
-        progress("trajectory", 0, 1)
-        found = locate(log, settings, stats, progress, first, match, bound, registrar_of, saved)
-        progress("trajectory", 1, 1)
-    with stats.stage("sharpness"):
-        trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
-        sample = SweepSample(log, folder=saved)
-        figures = of_sample(sample, trajectories, progress)
-        sample.sweeps.forget()  # 100 MB
-    names = "map", "gnss and imu" if log.given is None else "given poses"
-    return replace(found, without_lidar=None), dict(zip(names, figures, strict=False))
-
-
-def saving_sweeps(log: SensorLog, folder: Path) -> SensorLog:
-    """The log, of which the sweeps that are needed once more beside mapping are saved when they are read."""
-    log = SweepSample(log, folder=folder).sweeps.listening()
-    return pattern_sweeps(log, folder).listening()
-
-
-def map_drive(
-    drive: Drive,
-    folder: Path,
-    work: Path,
-    stats: RunStats,
-    progress: Progress = silent,
-    *,
-    resume: bool = False,
-    elsewhere: Elsewhere | None = None,
-    labels_from: str = "",
-) -> Mapped:
-    """Raw map and evidence of a drive whose trajectory is known; see `run`."""
-    with stats.stage("mapping"):
-        store = map_scans(
-            _remembered(drive, work, resume, labels_from),
-            work,
-            stats,
-            progress,
-            resume=resume,
-            elsewhere=elsewhere,
-            labels_from=labels_from,
-        )
-        release_memory(always=True)  # of the chunks: a tile of the map is the sum of those of many
-        write_raw(store, folder, drive.log.frame)
-    if stats.counts["points"] - stats.counts["points left out"] == stats.counts["points of moving objects"]:
-        stats.warnings.append("all points were removed as moving: the pictures show the removed points")
-    return Mapped(
-        drive.log,
-        drive.trajectory,
-        stats,
-        store.objects(),
-        store.untracked(),
-    )
+    return MappedLog(job.made, log, Trajectory(**job.needed("placed").of("track")), stats)
 
 
 def refine(
@@ -295,24 +257,3 @@ def refine(
     with stats.stage("refinement"):
         raw = open_raw(folder, open_label_set(settings.classes))
         return refine_map(raw, folder, settings, progress, earlier, executor=executor, work=work)
-
-
-def check_drive(
-    log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats, force: bool = False
-) -> Preflight:
-    """The pre-flight check; amber findings, and red ones with `force`, become warnings. Raises PreflightError."""
-    with stats.stage("preflight"):
-        page = preflight.check(log, settings, segmenter, with_camera=segmenter is not None)
-    if page.level is Level.RED and not force:
-        raise PreflightError(log.name, page)
-    stats.warnings.extend(str(finding) for finding in (*page.of(Level.RED), *page.of(Level.AMBER)))
-    return page
-
-
-def _remembered(drive: Drive, work: Path, resume: bool, labels_from: str) -> Drive:
-    """The drive with a network whose answers are kept in `work`: --resume segments no image twice."""
-    if drive.segmenter is None or not drive.log.cameras or isinstance(drive.segmenter, CachedLabels):
-        return drive
-    sizes = drive.log.calibration.image_sizes
-    folder = probabilities_folder(work, fingerprints.of_probabilities(drive, labels_from), resume, sizes)
-    return replace(drive, segmenter=CachedSegmenter(drive.segmenter, drive.label_set, sizes, folder))

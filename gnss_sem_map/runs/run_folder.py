@@ -1,4 +1,4 @@
-"""Writing of the run folder: all results of one drive."""
+"""Writing of the run folder: what is known of drives and of a map."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.config import DeliverySettings, Settings
+from gnss_sem_map.dynamics.motion_state import TrackedObject
 from gnss_sem_map.dynamics.movers import movers_of
 from gnss_sem_map.export.dates import are_dates
 from gnss_sem_map.export.exported import Exported, sure_part
@@ -46,16 +46,7 @@ from gnss_sem_map.mapping.trajectory import DriveTrajectory
 from gnss_sem_map.preflight.findings import Preflight
 from gnss_sem_map.process.run_stats import Progress, RunStats, silent
 from gnss_sem_map.process.thread_pools import leaving_all
-from gnss_sem_map.runs.about import (
-    about_map,
-    about_mapped,
-    about_run,
-    about_solution,
-    metrics_of,
-    seconds_of,
-    with_objects,
-)
-from gnss_sem_map.runs.pipeline import Located, Mapped
+from gnss_sem_map.runs.about import about_map, about_run, about_solution, seconds_of
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_settings import COPIES, write_settings
 from gnss_sem_map.runs.source import Source, source_of
@@ -79,10 +70,10 @@ def is_run_file(name: str) -> bool:
 
 @contextmanager
 def claimed_run(
-    out: Path, inputs: Iterable[Path | str | None] = (), is_resumable: bool = False, waits: bool = False
+    out: Path, inputs: Iterable[Path | str | None] = (), is_resumable: bool = False
 ) -> Iterator[Claim]:
     """Hold the output folder of a run exclusively; see `files.output_folder.claimed`."""
-    with claimed(out, inputs, is_run_file, is_resumable, waits) as claim, leaving_all():
+    with claimed(out, inputs, is_run_file, is_resumable) as claim, leaving_all():
         yield claim
 
 
@@ -96,54 +87,13 @@ def places_read(
     return [*drives, *specs, *named, config]
 
 
-def write_run(
-    folder: Path,
-    source: Source,
-    mapped: Mapped,
-    refined: Refined,
-    settings: Settings,
-    read: str,
-    write_labels: bool,
-    progress: Progress = silent,
+def write_objects(
+    folder: Path, name: str, log: SensorLog, objects: Sequence[TrackedObject], settings: Settings
 ) -> None:
-    """Write everything that a run of one drive made beside its maps, which are in the folder already.
-
-    `read`: digest of all that was read.
-    """
-    refined = replace(refined, report=with_objects(refined.report, mapped))
-    if write_labels:
-        with mapped.stats.stage("labels"):
-            labelled = LabelledDrive(folder, mapped.log, mapped.trajectory)
-            write_point_labels(folder, [labelled], refined.kerbs, settings, progress)
-    with mapped.stats.stage("export"):
-        write_plot(folder, mapped.log, mapped.solution)
-        write_objects(folder, source.name, mapped, settings)
-        scans = mapped.log.scans
-        track = mapped.trajectory.during(scans[0].stamp, scans[-1].stamp)
-        write_map_files(folder, [track], mapped.log.name, settings.delivery, progress=progress)
-    about = about_mapped(source, mapped) | {"read": read, "map": about_map(folder, refined.report)}
-    write_about(folder, settings, about, metrics_of(mapped))
-
-
-def write_drive(
-    folder: Path, source: Source, mapped: Mapped, settings: Settings, read: str, correction: str
-) -> None:
-    """Write what is known of one of several drives beside its raw map, which is in the folder already.
-
-    `read`: digest of all that was read; `correction`: of that with which it is bound to others, empty without.
-    """
-    write_plot(folder, mapped.log, mapped.solution)
-    write_objects(folder, source.name, mapped, settings)
-    about = about_mapped(source, mapped) | {"read": read, "correction": correction}
-    write_about(folder, settings, about, metrics_of(mapped))
-
-
-def write_objects(folder: Path, name: str, mapped: Mapped, settings: Settings) -> None:
     """Write what moved in a drive of this name."""
     label_set = open_label_set(settings.classes)
     movable = {label_set.names[label]: str(label_set.roles[label]) for label in label_set.having(*MOVABLE)}
-    log = mapped.log
-    write_movers(movers_of(mapped.objects, movable), DriveOfMovers(name, log.epoch_ns, log.frame), folder)
+    write_movers(movers_of(objects, movable), DriveOfMovers(name, log.epoch_ns, log.frame), folder)
 
 
 def write_again(
@@ -258,8 +208,10 @@ def write_trajectory_run(
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with claimed_run(out, [drive]), new_folder(out) as folder:
-        write_trajectory_files(folder, Located(log, found.trajectory, found.solution, found.alone))
-        write_plot(folder, log, found.solution)
+        rejected = None if found.solution is None else found.solution.rejected
+        write_trajectory_files(folder, log, found.trajectory, found.alone, rejected)
+        if found.solution is not None and log.gnss is not None:
+            write_trajectory_plot(found.solution, log.gnss, folder / "trajectory.png")
         write_settings(folder, settings)
         about = about_run(source_of(drive).name, log, stats) | {
             "preflight": page.as_dict(),
@@ -269,42 +221,39 @@ def write_trajectory_run(
     return about
 
 
-def write_trajectory_files(folder: Path, located: Located, delivery: DeliverySettings | None = None) -> None:
-    """Write a trajectory in every format, and that before it was bound, if it was.
-
-    Raises ConfigError where files of its map could not be delivered in the coordinates that are asked for.
-    """
-    trajectory, frame = located.trajectory, located.log.frame
-    if frame is not None and delivery is not None:
+def check_deliverable(trajectory: Trajectory, frame: LocalFrame | None, delivery: DeliverySettings) -> None:
+    """Raise ConfigError where files of a map along it could not be delivered in the coordinates that are asked for."""
+    if frame is not None:
         Georeference.of(frame, delivery).from_map(trajectory.positions)
+
+
+def write_trajectory_files(
+    folder: Path,
+    log: SensorLog,
+    trajectory: Trajectory,
+    alone: Trajectory | None = None,
+    rejected: NDArray[np.bool_] | None = None,
+) -> None:
+    """Write a trajectory in every format, and that before it was bound, if it was; `rejected` fixes are told."""
     trajectory.save(folder / "trajectory.parquet")
-    if located.alone is not None:
-        located.alone.save(folder / "trajectory_alone.parquet")
+    if alone is not None:
+        alone.save(folder / "trajectory_alone.parquet")
     write_tum(trajectory, folder / "trajectory.tum")
     if trajectory.covariances is not None:
         write_covariance_tum(trajectory, folder / "trajectory_covariance.tum")
     write_kitti(trajectory, folder / "trajectory_kitti.txt")
-    if frame is not None:
-        write_geojson(trajectory, frame, folder / "trajectory.geojson")
-        _write_navigation(folder, located, frame)
-
-
-def _write_navigation(folder: Path, located: Located, frame: LocalFrame) -> None:
-    """Write what tells of the fixes along the track, and the SBET, where the log has dates."""
-    trajectory, log, solution = located.trajectory, located.log, located.solution
+    if log.frame is None:
+        return
+    write_geojson(trajectory, log.frame, folder / "trajectory.geojson")
     times = log.epoch_ns + np.round(1e9 * trajectory.stamps[[0, -1]]).astype(np.int64)
     if are_dates(times).all():
-        write_sbet(trajectory, frame, log.epoch_ns, folder / "trajectory.sbet")
-    fixes = None if log.gnss is None or solution is None else log.gnss.stamps
-    rejected = None if fixes is None or solution is None else solution.rejected
-    write_geoparquet(trajectory, frame, log.epoch_ns, folder / "trajectory_wgs84.parquet", fixes, rejected)
-    write_attitude(trajectory, frame, folder / "trajectory_attitude.csv", fixes, rejected)
-
-
-def write_plot(folder: Path, log: SensorLog, solution: Solution | None) -> None:
-    """Write a plot of the trajectory where it was smoothed."""
-    if solution is not None and log.gnss is not None:
-        write_trajectory_plot(solution, log.gnss, folder / "trajectory.png")
+        write_sbet(trajectory, log.frame, log.epoch_ns, folder / "trajectory.sbet")
+    fixes = None if log.gnss is None or rejected is None else log.gnss.stamps
+    rejected = None if fixes is None else rejected
+    write_geoparquet(
+        trajectory, log.frame, log.epoch_ns, folder / "trajectory_wgs84.parquet", fixes, rejected
+    )
+    write_attitude(trajectory, log.frame, folder / "trajectory_attitude.csv", fixes, rejected)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 So the file of a scan is read once before it is mapped, by whichever process gets to it. Each use has files of its own:
 
 FOLDER/NUMBER.USE.npz    rows (n, 4) float32 x, y, z in m and intensity, and the stamps (n,) of its points, if they have
+                         (a file of the memo, see `files.memo`)
 """
 
 from __future__ import annotations
@@ -13,19 +14,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.archives import npz_of, open_archive
-from gnss_sem_map.files.atomic import unfinished
+from gnss_sem_map.files.memo import recall, remember
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
-
-
-@dataclass(frozen=True, eq=False)
-class _Saved:
-    rows: NDArray[np.float32]
-    stamps: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,20 +70,21 @@ class ThinnedSweeps:
         """What was saved; None where there is nothing, or it is damaged."""
         if self.folder is None or number not in self.numbers:
             return None
-        with suppress(DataError), open_archive(self._file(number)) as archive:
-            rows = archive.array("rows").read()
-            stamps = archive.array("stamps").read() if "stamps" in archive else None
-            return Points(rows[:, :3], rows[:, 3], stamps)
-        return None
+        found = recall(self._file(number), self.use)
+        if found is None:
+            return None
+        rows = found.arrays["rows"]
+        return Points(rows[:, :3], rows[:, 3], found.arrays.get("stamps"))
 
     def _save(self, number: int, points: Points) -> None:
         """It is no loss where it cannot be saved: the sweep is read again."""
         if self.folder is None or number not in self.numbers:
             return
-        file = self._file(number)
-        beside = unfinished(file)
-        try:
-            beside.write_bytes(npz_of(_Saved(points.rows.reshape(-1, 4), points.stamps)))
-            beside.replace(file)
-        except OSError:
-            beside.unlink(missing_ok=True)
+        arrays = {"rows": points.rows.reshape(-1, 4)}
+        with suppress(DataError):
+            remember(
+                self._file(number),
+                self.use,
+                {},
+                arrays if points.stamps is None else {**arrays, "stamps": points.stamps},
+            )

@@ -27,6 +27,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
 from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.runs import pipeline
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_folder import about_run
 from gnss_sem_map.segmentation import Segmenter
@@ -84,11 +85,9 @@ def unaccounted(place: Place, harm: Harm, out: Path, with_labels: bool) -> list[
     """Map a drive, and say which laws do not hold."""
     log = open_drive(place.drive)
     segmenter = place.segmenter(log) if with_labels else None
-    out.mkdir()
-    work = out.with_name(f"{out.name}.work")
-    mapped = pipeline.run(
-        log, segmenter, SETTINGS, out, work, force=True
-    )  # so short and damaged, it may look wrong
+    run = MapJob(SETTINGS, log.frame, out, is_one=True)
+    mapped = pipeline.map_log(log, segmenter, run, force=True)  # so short and damaged, it may look wrong
+    out = mapped.folder
     kerbs = pipeline.refine(out, SETTINGS, mapped.stats).kerbs
     write_point_labels(out, [LabelledDrive(out, mapped.log, mapped.trajectory)], kerbs, SETTINGS)
     refined, static = tiles.read(out / "refined"), tiles.read(out / "refined").standing

@@ -15,10 +15,10 @@ from processes import group, wait_until
 from street import Street
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping.fusion import map_scans
-from gnss_sem_map.process.run_stats import RunStats
 from gnss_sem_map.process.worker_processes import Processes
-from gnss_sem_map.runs.chunk_tasks import ChunkTasks
+from gnss_sem_map.runs import pipeline
+from gnss_sem_map.runs.drive_job import job_for
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.runs.source import source_of
 
 pytestmark = pytest.mark.faults
@@ -80,14 +80,13 @@ def test_a_worker_that_is_killed_again_and_again_is_an_error_in_one_line(
 ) -> None:
     (tmp_path / "deadly_network.py").write_text(DEADLY)
     monkeypatch.syspath_prepend(tmp_path)
-    drive = street_drive(small_drive.drive, small_drive.labels)
-    source = source_of(small_drive.drive, "python:deadly_network:look")
-    drive = replace(drive, segmenter=source.open_network(drive.settings, drive.log))
+    settings = street_drive(small_drive.drive, small_drive.labels).settings
+    labels = source_of(small_drive.drive, f"labels:{small_drive.labels}")
+    run = MapJob(settings, None, tmp_path, Processes(2), is_one=True)
     with pytest.raises(
         DataError, match=r"chunks \d to \d: given up after 3 attempts: 3 x a worker process died"
     ):
-        map_scans(
-            drive, tmp_path / "work", RunStats(),
-            elsewhere=ChunkTasks(source, Processes(2)), labels_from=source.labels_from,
-        )  # fmt: skip
+        pipeline.bound_and_mapped(
+            [job_for(replace(labels, segmenter="python:deadly_network:look"), run, True)], run
+        )
     trial("workers")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,15 +23,14 @@ from gnss_sem_map.datasets.given_trajectory import read_tum
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping import passes
+from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.trajectory import locate
 from gnss_sem_map.process.run_stats import RunStats
-from gnss_sem_map.runs import bound_drives, finished_run, many_drives, run_folder
-from gnss_sem_map.runs.bound_drives import KnownTrack, groups_of
+from gnss_sem_map.runs import drive_tasks, finished_run, many_drives
+from gnss_sem_map.runs.binding import groups_of
 from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
-from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.deskew import points_in_map
-from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import Camera, Lidar, simulate
 
 pytestmark = pytest.mark.integration
@@ -125,7 +123,7 @@ def test_a_day_that_is_added_moves_the_first_one_as_a_run_of_both_does(
         patch.setattr(many_drives, "write_drives", stopped)
         with pytest.raises(KeyboardInterrupt):
             remove_drive(out, days[1].name)
-    monkeypatch.setattr(run_folder, "write_drive", stopped)  # the first day was mapped again
+    monkeypatch.setattr(drive_tasks, "write_map", stopped)  # the first day was mapped again
     remove_drive(out, days[1].name, resume=True)
     assert products(out)[f"drives/{days[0].name}/trajectory.tum"] == alone["trajectory.tum"]
 
@@ -147,27 +145,27 @@ def test_a_drive_is_not_added_where_one_that_it_moves_is_gone(days: list[Path], 
 def test_a_drive_that_is_left_out_moves_no_other(
     days: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its labels are missing, which is seen when all drives are bound and it is mapped."""
+    """Its labels are missing, which is seen before it is bound; or no scan of it can be mapped, which is seen later."""
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels" / days[0].name).symlink_to(days[0] / "truth/train_ids")
     how = HowMapped(f"labels:{tmp_path}/labels/{{drive}}", force=True)
-    with monkeypatch.context() as patch:
-        patch.setattr(many_drives, "write_drives", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            run_drives(days, tmp_path / "both", Settings(), how)
-    mapped: list[str] = []
-    write_drive = run_folder.write_drive
-
-    def noted(folder: Path, source: Source, *rest: Any) -> None:
-        mapped.append(source.name)
-        write_drive(folder, source, *rest)
-
-    monkeypatch.setattr(run_folder, "write_drive", noted)
-    made = run_drives(days, tmp_path / "both", Settings(), replace(how, resume=True))
-    assert mapped == [], "the other one was mapped when this one had failed"
+    run_drives(days[:1], tmp_path / "one", Settings(), how)
+    made = run_drives(days, tmp_path / "both", Settings(), how)
     assert list(made.failed) == [days[1].name]
     assert made.about["passes"] == []
-    run_drives(days[:1], tmp_path / "one", Settings(), how)
+    assert products(tmp_path / "both") == products(tmp_path / "one")
+    write_map = drive_tasks.write_map
+
+    def fails(drive: Drive, *rest: Any) -> None:
+        if drive.log.name == days[1].name:
+            raise DataError("no scan can be used")
+        write_map(drive, *rest)
+
+    monkeypatch.setattr(drive_tasks, "write_map", fails)
+    one = replace(how, segmenter=f"labels:{tmp_path}/labels/{days[0].name}")
+    run_drives(days[:1], tmp_path / "one", Settings(), one)
+    made = run_drives(days, tmp_path / "both", Settings(), one)
+    assert made.failed == {days[1].name: "no scan can be used"}
     assert products(tmp_path / "both") == products(tmp_path / "one")
 
 
@@ -183,40 +181,6 @@ def test_tracks_are_grouped_by_where_they_come_near() -> None:
     }
     assert groups_of(tracks) == [["a", "b", "c"], ["d"], ["e"]]
     assert groups_of({}) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("has_gaps", [True, False])
-def test_drives_that_meet_where_neither_has_a_fix_are_bound(
-    has_gaps: bool, days: list[Path], both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fixes_of(sources: Sequence[Source], frame: LocalFrame, settings: Settings) -> dict[str, KnownTrack]:
-        found = tracks_of_drives(sources, frame, settings)
-        parts = dict(zip((drive.name for drive in days), (slice(0, 5), slice(-5, None)), strict=True))
-        return {name: KnownTrack(found[name].positions[parts[name]], has_gaps) for name in found}
-
-    tracks_of_drives = many_drives._tracks
-    monkeypatch.setattr(many_drives, "_tracks", fixes_of)
-    monkeypatch.setattr(bound_drives, "NEAR_M", 15.0)
-    run_drives(days, tmp_path / "both", Settings(), HOW)
-    assert bool(read_run(tmp_path / "both")["passes"]) == has_gaps
-    if has_gaps:
-        assert products(tmp_path / "both") == products(both)
-
-
-def test_a_drive_has_gaps_where_it_may_have_been_elsewhere(days: list[Path]) -> None:
-    log = open_drive(days[0], with_imu=False)
-    assert log.gnss is not None
-
-    def with_fixes(kept: np.ndarray) -> SensorLog:
-        assert log.gnss is not None
-        return replace(log, gnss=log.gnss[kept])
-
-    since = log.gnss.stamps - log.scans[0].stamp
-    assert not many_drives._has_gaps(log)
-    assert not many_drives._has_gaps(with_fixes((since < 2.0) | (since > 4.5)))
-    for gap in ((since < 2.0) | (since > 6.0), since > 4.0, since < 4.0):
-        assert many_drives._has_gaps(with_fixes(gap))
 
 
 def write_base(drive: Path, path: Path, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:

@@ -8,7 +8,7 @@ import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import pytest
 import street
@@ -22,7 +22,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files.ownership import foreign, write_list
-from gnss_sem_map.runs import bound_drives, finished_run
+from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
@@ -117,24 +117,6 @@ def test_a_disk_that_is_full_at_once_is_an_error_that_says_where(
     with pytest.raises(DataError, match=r"\.out\.work: cannot be written \(No space .*free the disk"):
         mapped("ab", drives, tmp_path / "out", how)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_drive_that_cannot_be_bound_is_named(
-    drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = bound_drives._locate_one
-
-    def fails(source: Source, *rest: Any) -> None:
-        if source.name == "b":
-            raise OSError(errno.EIO, os.strerror(errno.EIO), "/torn/disk")
-        original(source, *rest)
-
-    monkeypatch.setattr(bound_drives, "_locate_one", fails)
-    made = mapped("ab", drives, tmp_path / "out", how)
-    assert made.about["merged"] == ["a", "b"]
-    assert made.about["warnings"] == [
-        f"b: could not be bound to other drives (/torn/disk: {os.strerror(errno.EIO)})"
-    ]
 
 
 def test_where_no_drive_can_be_mapped_nothing_is_written(

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, astuple, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
@@ -30,13 +28,16 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.files.ownership import CONTENT_BYTES, write_list
+from gnss_sem_map.mapping.fusion import store_of
+from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.process.execution import Task, path_of
 from gnss_sem_map.process.worker_processes import Processes
-from gnss_sem_map.runs import finished_run, many_drives, pipeline, run_folder
-from gnss_sem_map.runs.drive_tasks import map_one
+from gnss_sem_map.runs import drive_tasks, finished_run, many_drives, pipeline, run_folder
+from gnss_sem_map.runs.binding import bind
+from gnss_sem_map.runs.drive_job import DriveJob, closing_drives, job_for
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.runs.source import source_of
-from gnss_sem_map.sensor_log import SensorLog
 
 KILLED_BY_ITSELF = """
 import os, signal, sys
@@ -44,7 +45,7 @@ import os, signal, sys
 def look(event, details):
     place = os.fsdecode(details[1]) if event == "os.rename" else ""
     folder, _, name = place.rpartition("/")
-    if folder.endswith("/drives/.b.work") and name.isdecimal():  # a chunk of its scans is put away
+    if folder.endswith("/drives") and name == "b":  # its map is put away
         os.kill(os.getpid(), signal.SIGKILL)
 
 sys.addaudithook(look)
@@ -87,10 +88,10 @@ def test_a_run_that_is_stopped_in_its_first_drive_keeps_the_chunks(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
     out, chunk = tmp_path / "out", tmp_path / ".out.work/drives/.a.work/0"
-    ended = stop_of(lambda: mapped("ab", drives, out, how), run_folder, "write_drive")
+    ended = stop_of(lambda: mapped("ab", drives, out, how), drive_tasks, "_put")
     assert ended.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
     there = (chunk / "record.json").stat()
-    stop_of(lambda: mapped("ab", drives, out, replace(how, resume=True)), run_folder, "write_drive")
+    stop_of(lambda: mapped("ab", drives, out, replace(how, resume=True)), drive_tasks, "_put")
     assert os.path.samestat((chunk / "record.json").stat(), there), "the chunk is mapped again"
     mapped("ab", drives, out, replace(how, resume=True))
     assert_same(out, made["ab"])
@@ -99,13 +100,13 @@ def test_a_run_that_is_stopped_in_its_first_drive_keeps_the_chunks(
 
 def calls_of_the_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the drives that are mapped from now on."""
-    calls, original = [], pipeline.run
+    calls, original = [], drive_tasks.write_map
 
-    def watched(log: SensorLog, *rest: Any, **named: Any) -> pipeline.Mapped:
-        calls.append(log.name)
-        return original(log, *rest, **named)
+    def watched(drive: Drive, *rest: Any) -> None:
+        calls.append(drive.log.name)
+        original(drive, *rest)
 
-    monkeypatch.setattr(pipeline, "run", watched)
+    monkeypatch.setattr(drive_tasks, "write_map", watched)
     return calls
 
 
@@ -150,8 +151,8 @@ def test_what_is_damaged_of_an_interrupted_run_is_made_again(
 ) -> None:
     out, work = tmp_path / "out", tmp_path / ".out.work"
     stop_of(lambda: mapped("ab", drives, out, how), many_drives, "write_drives")
-    halved(work / "bound/a/condensed.npz")
-    flipped(work / "bound/b/trajectory.npz")
+    halved(work / "drives/.a.work/located.npz")
+    flipped(work / "drives/.b.work/checked.npz")
     halved(work / "drives/a/run.json")
     (work / "drives/b/metrics.json").unlink()
     calls = calls_of_the_pipeline(monkeypatch)
@@ -198,7 +199,7 @@ def test_a_run_that_was_stopped_when_the_map_was_there_does_nothing_twice(
     out, calls = shutil.copytree(made[names], tmp_path / "out"), calls_of_the_pipeline(monkeypatch)
 
     def resumed(**more: Any) -> None:
-        (tmp_path / ".out.work/matches").mkdir(parents=True)  # it was killed when it cleaned up
+        (tmp_path / ".out.work/drives").mkdir(parents=True)  # it was killed when it cleaned up
         write_list(tmp_path / ".out.work")
         if len(names) == 1:
             more = {"settings": SETTINGS, **more}
@@ -240,54 +241,38 @@ def test_commands_find_the_result_that_a_killed_one_had_moved_away(
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def call_of_map_one(drives: Drives, work: Path) -> tuple[Path, Path, tuple[Any, ...]]:
-    """The file of its settings, its folder, and the arguments of the task that maps the first drive."""
-    settings, folder = work / "config.yaml", work / "drives/a"
-    settings.write_text(SETTINGS.to_yaml())
-    folder.parent.mkdir()
-    frame, source = open_drive(drives.by_name["a"]).frame, source_of(drives.by_name["a"], drives.labels)
-    assert frame is not None
-    return settings, folder, (asdict(source), str(settings), astuple(frame), str(folder), True, "")
-
-
-def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Drives, tmp_path: Path) -> None:
+def test_a_drive_that_two_workers_write_at_once_is_there_once(drives: Drives, tmp_path: Path) -> None:
     """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
-    _, folder, words = call_of_map_one(drives, tmp_path)
-    task = Task("a", path_of(map_one), words)
+    job, words = stopped_before_it_is_written(drives, tmp_path)
+    task = Task("a", path_of(drive_tasks.finish), words)
     with closing(Processes(2)) as processes:
-        assert [reason for _, reason in processes.run([task, replace(task)])] == ["", ""]
-    assert (folder / "run.json").is_file()
-    assert [path.name for path in folder.parent.iterdir()] == ["a"]
+        assert [found for _, found in processes.run([task, replace(task)])] == [None, None]
+    assert (job.made / "run.json").is_file()
+    assert sorted(path.name for path in job.made.parent.iterdir()) == [".a.work", "a"]
 
 
-def test_a_call_that_waited_until_another_run_had_begun_does_nothing(drives: Drives, tmp_path: Path) -> None:
-    settings, folder, words = call_of_map_one(drives, tmp_path)
-    answers: list[str] = []
-    with (folder.parent / ".a.lock").open("w") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        waiting = threading.Thread(target=lambda: answers.append(map_one(*words)), daemon=True)
-        waiting.start()
-        waiting.join(1.0)
-        assert waiting.is_alive()
-        settings.unlink()
-    waiting.join(30.0)
-    (reason,) = answers
-    assert reason == f"{settings}: is gone; this task is of a run that has ended"
-    assert not folder.exists()
-
-
-def test_a_run_does_not_begin_anew_while_a_task_of_an_earlier_one_still_writes(
-    drives: Drives, how: HowMapped, tmp_path: Path
+def test_a_task_of_a_run_that_was_followed_by_another_one_does_nothing(
+    drives: Drives, tmp_path: Path
 ) -> None:
-    stop_of(lambda: mapped("ab", drives, tmp_path / "out", how), run_folder, "write_drive")
-    lock = tmp_path / ".out.work/drives/.b.lock"
-    with lock.open("w") as other:
-        other.write("gnss-sem-map writes it now (process 7 on far)")
-        other.flush()
-        fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(DataError, match=r"drives/b: gnss-sem-map writes it now \(process 7 on far\)"):
-            mapped("ab", drives, tmp_path / "out", how)
-    mapped("ab", drives, tmp_path / "out", how)
+    job, words = stopped_before_it_is_written(drives, tmp_path)
+    replace(job, force=not job.force).begin()
+    with pytest.raises(DataError, match=r"job\.json: is gone; this task is of a run that has ended$"):
+        drive_tasks.finish(*words)
+    assert not job.made.exists()
+
+
+def stopped_before_it_is_written(drives: Drives, work: Path) -> tuple[DriveJob, tuple[Any, ...]]:
+    """The first drive, all of whose chunks are mapped, and the arguments of the task that writes its map."""
+    run = MapJob(SETTINGS, open_drive(drives.by_name["a"]).frame, work)
+    job = job_for(source_of(drives.by_name["a"], drives.labels), run, force=True)
+    with closing_drives():
+        [one], _ = (list(found.values()) for found in pipeline.locate_drives([job], run))
+        bound = bind({"a": one}, {}, run).keys["a"]
+        placed = drive_tasks.place(*job.key, one.located, bound)
+        count = len(placed["chunks"])
+        store_of(job.folder, placed["map"], count, SETTINGS).begun(resume=False)
+        drive_tasks.map_range(*job.key, placed["map"], 0, count)
+    return job, (*job.key, {"located": one.located, "bound": bound, "mapped": placed["map"]}, 0.0)
 
 
 def test_a_removal_that_was_stopped_when_the_map_was_there_does_nothing_twice(

@@ -340,7 +340,7 @@ from gnss_sem_map.voxels.attributes import NOTHING
 from gnss_sem_map.labels.label_set import open_label_set
 
 folder, written = Path(sys.argv[2]), random_map(count=200_000)
-store = checkpoints.open_store(folder / "work", "x", 1, False, 0.2, open_label_set())
+store = checkpoints.ChunkStore(folder / "work", "x", 1, 0.2, open_label_set()).begun(resume=False)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 for attempt in (
     lambda: tiles.write(written, folder / "map", FRAME),

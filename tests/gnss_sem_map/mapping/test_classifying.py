@@ -267,7 +267,7 @@ def test_a_classifier_that_does_not_fit_is_refused_before_the_work(
     of = replace(of, names=("road", "lawn", *of.names[2:])) if wrong == "classes" else of
     file.write_bytes(b"no" if wrong == "bytes" else of.to_bytes())
     settings = Settings().changed(f"geometric_classifier.model={file}")
-    monkeypatch.setattr("gnss_sem_map.runs.pipeline.locate", None)
+    monkeypatch.setattr("gnss_sem_map.runs.drive_tasks.first_trajectory", None)
     with pytest.raises(DataError, match=r"model\.npz: (is of|cannot be used)") as refused:
         run(small_drive.drive, tmp_path / "out", f"labels:{small_drive.labels}", settings, force=True)
     assert "\n" not in str(refused.value)

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError, amber, green, red
+from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.check_page import check_writable, write_check_page
-from gnss_sem_map.runs.pipeline import run
 
 RED = red("IMU axes", "mean specific force -9.8 m/s² along z", "z points down: FRD?", "set imu_axes: frd")
 AMBER = amber("GNSS", "5 % of the fixes stand still", "frozen receiver", "leave them out")
@@ -115,16 +115,9 @@ def test_a_red_drive_is_mapped_only_when_it_is_forced(small_drive: Street, tmp_p
 
 def test_run_is_checked_from_python_too(small_drive: Street, tmp_path: Path) -> None:
     from gnss_sem_map import config
-    from gnss_sem_map.datasets import open_drive
 
     with pytest.raises(PreflightError, match="imu_axes"):
-        run(
-            open_drive(upside_down(small_drive, tmp_path)),
-            None,
-            config.load(),
-            tmp_path / "out",
-            tmp_path / "work",
-        )
+        finished_run.run(upside_down(small_drive, tmp_path), tmp_path / "out", settings=config.load())
 
 
 def test_another_time_offset_than_that_of_the_smoother_is_said() -> None:

@@ -23,6 +23,7 @@ from gnss_sem_map.refinement import kerb_points
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.kerbs import KerbSettings, find_kerbs
 from gnss_sem_map.runs import pipeline
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
 from gnss_sem_map.voxels import tiles
@@ -161,8 +162,10 @@ def told(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
     segmenter = open_segmenter(
         f"labels:{street / 'truth' / 'train_ids'}", URBAN, sizes=log.calibration.image_sizes
     )
-    folder, settings = tmp_path_factory.mktemp("run"), config.Settings()
-    mapped = pipeline.run(log, segmenter, settings, folder, folder / "work")
+    settings = config.Settings()
+    run = MapJob(settings, log.frame, tmp_path_factory.mktemp("run"), is_one=True)
+    mapped = pipeline.map_log(log, segmenter, run)
+    folder = mapped.folder
     kerbs = pipeline.refine(folder, settings, mapped.stats).kerbs
     maps = [tiles.open_map(folder / name) for name in ("map", "refined")]
     moving = evidence.read(folder, URBAN).moving_points

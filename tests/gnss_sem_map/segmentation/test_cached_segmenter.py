@@ -11,7 +11,9 @@ from faults.killing import content
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.process.run_stats import Progress, silent
 from gnss_sem_map.runs import pipeline
+from gnss_sem_map.runs.map_job import MapJob
 from gnss_sem_map.sensor_log import Image
 
 
@@ -44,16 +46,20 @@ def test_resuming_asks_a_network_nothing_again(small_drive: street.Street, tmp_p
         Settings.model_validate({"dynamics": {"window_scans": 2}}),
     )
     first, second, other = Counting(), Counting(), Counting()
+
+    def made(network: Counting, work: str, progress: Progress = silent) -> Path:
+        run = MapJob(settings, log.frame, tmp_path / work, progress=progress, is_one=True)
+        return pipeline.map_log(log, network, run, labels_from="net").folder
+
     with pytest.raises(Interrupted):
-        pipeline.run(
-            log, first, settings, tmp_path / "a", tmp_path / "work", stop_at_mapping, labels_from="net"
-        )
+        made(first, "work", stop_at_mapping)
     assert len(set(first.asked)) == len(first.asked) >= 8
-    damaged = tmp_path / "work/answers/7.npz"
+    (damaged,) = (tmp_path / "work").glob("drives/.*.work/answers/7.npz")
     damaged.write_bytes(damaged.read_bytes()[:-40])
-    pipeline.run(log, second, settings, tmp_path / "a", tmp_path / "work", resume=True, labels_from="net")
+    again = made(second, "work")
     never_asked = {image.number for image in log.images} - set(first.asked)
     assert sorted(second.asked) == sorted({7} | never_asked), "only the damaged image is segmented again"
-    pipeline.run(log, other, settings, tmp_path / "b", tmp_path / "other", resume=True, labels_from="net")
-    assert content(tmp_path / "a") == content(tmp_path / "b")
+    at_once = made(other, "other")
+    for name in ("map", "attributes", "evidence"):
+        assert content(again / name) == content(at_once / name)
     assert sorted(other.asked) == [image.number for image in log.images], "once each; nothing is there"

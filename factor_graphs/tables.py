@@ -53,8 +53,8 @@ _RATE = "w g gyr gyro gyroscope omega angularvelocity angularvel angvel angularr
 ACROSS = "hacc horizontalaccuracy haccuracy accuracy"
 _NAMES: dict[str, dict[str, str]] = {
     "time": {
-        "stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc gpst sec secs"
-        " seconds secondselapsed timestartup gpstime sow tow gpstow",
+        "stamp_s": "stamp headerstamp time timestamp datetime t unixtime epoch utctime utc timeutc gpst timegpst"
+        " sec secs seconds secondselapsed timestartup gpstime sow tow gpstow",
     },
     "angle": {"lat_deg": "lat latitude", "lon_deg": "lon lng long longitude"},
     "length": {

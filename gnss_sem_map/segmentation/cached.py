@@ -88,7 +88,8 @@ class CachedLabels:
         if path is None:
             numbers = [number for _, number in self._files]
             raise MissingLabels(
-                f"{self._folder}: no labels of frame {image.frame}; {len(numbers)}: {min(numbers)} to {max(numbers)}"
+                f"{self._folder}: no labels of frame {image.frame}; {len(numbers)} frames have some, from"
+                f" {min(numbers)} to {max(numbers)}"
             )
         return self._read(path, self._sizes.get(image.camera))
 

@@ -48,6 +48,10 @@ def day_first(moment: np.datetime64, by: str) -> str:
     return f"{by.join(day.split('-')[::-1])} {clock}"
 
 
+def in_gps_time(rows: list[list[str]]) -> list[list[str]]:
+    return dated(rows, lambda t: str(t + np.timedelta64(18, "s")))
+
+
 def american(moment: np.datetime64) -> str:
     day, clock = str(moment).split("T")
     year, month, number = day.split("-")
@@ -133,6 +137,10 @@ SAME: dict[str, Change] = {
     "date and time apart": lambda h, r: joined(
         ["Date", "Time", *h[1:]], [[*row[0].split("T"), *row[1:]] for row in dated(r, str)]
     ),
+    "dates of GPS time by their name": lambda h, r: joined(["GPST", *h[1:]], in_gps_time(r)),
+    "dates of GPS time by their unit": lambda h, r: joined(["time [GPST]", *h[1:]], in_gps_time(r)),
+    "dates of GPS time by a line above": lambda h, r: "# time system: GPST\n" + joined(h, in_gps_time(r)),
+    "dates under GPS that are UTC": lambda h, r: joined(["gps_time", *h[1:]], dated(r, lambda t: f"{t}Z")),
     "ISO times and decimal commas": lambda h, r: joined(
         h, [commas(row) for row in dated(r, lambda t: str(t)[:-3])], ";"
     ),
@@ -220,6 +228,17 @@ def test_times_of_day_go_on_over_midnight() -> None:
 def test_what_is_no_table_with_names_is_told_the_way_out(content: bytes, said: str) -> None:
     with pytest.raises(MeasurementError, match=f"imu.csv: .*{said}"):
         parse_numbers(content, IMU_COLUMNS, "imu.csv", 0.5)
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1.0, "")])
+def test_a_unit_that_steps_show_is_told(scale: float, unit: str) -> None:
+    content, told = (
+        joined(["time", "speed"], [[f"{k * 0.25 * scale}", "1"] for k in range(9)]).encode(),
+        list[str](),
+    )
+    found = parse_numbers(content, ("stamp_s", "speed_mps"), "wheels.csv", 5.0, told=told)
+    np.testing.assert_allclose(found[:, 0], np.arange(9) * 0.25)
+    assert [f"taken as {unit}" in text for text in told] == [True] * bool(unit)
 
 
 def test_a_date_that_no_calendar_has_is_a_row_without_a_stamp() -> None:

@@ -162,10 +162,11 @@ def _best(
 
 def _velocity(sentence: Any) -> tuple[float, float] | None:
     """East and north, m/s, of a sentence with speed and course; None where it tells nothing."""
-    speed, course = {
-        "RMC": lambda: (sentence.spd if sentence.status == "A" else None, sentence.cog),
-        "VTG": lambda: (sentence.sogn, sentence.cogt),
-    }.get(sentence.msgID, lambda: (None, None))()
+    speed, course = None, None
+    if sentence.msgID == "RMC" and sentence.status == "A":
+        speed, course = sentence.spd, sentence.cog
+    elif sentence.msgID == "VTG":
+        speed, course = sentence.sogn, sentence.cogt
     if not isinstance(speed, float | int):
         return None
     speed *= MPS_PER_KNOT

@@ -207,7 +207,8 @@ def _table(bag: Bag, messages: Messages, k: int, more: tuple[str, ...]) -> NDArr
     if not 0 < n <= MOST_POINTS or data.size < (row_step * (height - 1) + row if has_gaps else n * step):
         raise refused(
             where,
-            f"found {n} points of {step} bytes in {data.size} bytes (row_step {row_step})",
+            f"found {n} points of {step} bytes in {data.size} bytes (row_step {row_step}), expected 1 to"
+            f" {MOST_POINTS}",
         )
     if has_gaps:
         data = np.ndarray((height, row), np.uint8, np.ascontiguousarray(data), 0, (row_step, 1)).ravel()

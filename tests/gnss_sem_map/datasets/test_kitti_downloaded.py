@@ -182,6 +182,14 @@ def test_a_sequence_as_downloaded(small_drive: Street, tmp_path: Path, camera: i
         open_drive(sequence)
 
 
+def test_the_pose_of_the_lidar_has_two_names(small_drive: Street, tmp_path: Path) -> None:
+    sequence = street.write_odometry(tmp_path, small_drive)
+    plain, calib = open_drive(sequence), sequence / "calib.txt"
+    calib.write_text(calib.read_text().replace("Tr:", "Tr_velo_to_cam:"))
+    [found], [expected] = (log.calibration.cameras for log in (open_drive(sequence), plain))
+    np.testing.assert_array_equal(found.T_camera_lidar, expected.T_camera_lidar)
+
+
 @pytest.mark.parametrize("depth", [1, 2])
 def test_the_folder_above_a_drive_offers_what_is_in_it(
     small_drive: Street, tmp_path: Path, depth: int

@@ -342,6 +342,24 @@ def test_scans_and_tables_of_a_log_as_other_programs_write_them(
         np.testing.assert_array_equal(a.read().stamps, b.read().stamps)
 
 
+def test_a_unit_of_time_that_steps_show_is_among_the_skips(
+    small_drive: street.Street, tmp_path: Path
+) -> None:
+    log = street.write_table_log(tmp_path / "log", small_drive)
+    plain, table = open_drive(log), log / "imu.csv"
+    assert [skip for skip in plain.skips if skip.what == "unit"] == []
+    head, *rows = (line.split(",") for line in table.read_text().splitlines())
+    lines = [["time", *head[1:]], *([f"{float(first) * 1e3:.6f}", *rest] for first, *rest in rows)]
+    table.write_text("\n".join(map(",".join, lines)))
+    found = open_drive(log)
+    [told] = [skip for skip in found.skips if skip.what == "unit"]
+    assert told.where.endswith("imu.csv")
+    assert "milliseconds" in told.reason
+    assert found.imu is not None
+    assert plain.imu is not None
+    np.testing.assert_allclose(found.imu.stamps, plain.imu.stamps, atol=1e-8)
+
+
 def test_a_unit_in_the_header_and_another_in_the_log_is_one_too_many(
     small_drive: street.Street, tmp_path: Path
 ) -> None:

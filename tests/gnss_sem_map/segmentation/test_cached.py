@@ -53,6 +53,16 @@ def test_probabilities_come_back_as_they_were_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(segment(frame(7)), written)
 
 
+@pytest.mark.parametrize("batch", [False, True])
+def test_classes_may_be_the_first_axis(tmp_path: Path, batch: bool) -> None:
+    """As networks have it, also in a batch of one."""
+    written = some_probabilities(shape=(4, 7, len(NAMES)))
+    first = written.transpose(2, 0, 1)
+    write_npz(tmp_path / "0.npz", first[None] if batch else first)
+    seen = open_segmenter(f"labels:{tmp_path}", URBAN, sizes={"": (7, 4)})(frame(0))
+    np.testing.assert_array_equal(seen, written)
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_floating_probabilities_come_as_float32(tmp_path: Path, dtype: type) -> None:
     written = (some_probabilities() / 255).astype(dtype)

@@ -61,6 +61,13 @@ def test_nmea_heights_are_above_the_ellipsoid(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.rows[:, :4], [[0, 49, 8.4, 160.1], [1, 49, 8.4, 160.1]], atol=1e-7)
 
 
+def test_nmea_in_utf_16_is_the_same(tmp_path: Path) -> None:
+    path = nmea(tmp_path, rmc(START_NS), gga(START_NS), gga(START_NS + 10**9))
+    plain = read(path).rows
+    path.write_bytes(path.read_bytes().decode().encode("utf-16"))
+    np.testing.assert_array_equal(read(path).rows, plain)
+
+
 def test_nmea_accuracy_by_gst_else_by_quality_and_dilution(tmp_path: Path) -> None:
     sentences = [
         rmc(START_NS),

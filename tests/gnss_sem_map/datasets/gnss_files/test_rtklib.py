@@ -32,6 +32,14 @@ def test_a_pos_file_in_gps_time(tmp_path: Path) -> None:
     assert found.skips == []
 
 
+@pytest.mark.parametrize("name", ["rover.csv", "gnss.txt"])
+def test_a_pos_file_between_commas_under_another_ending(tmp_path: Path, name: str) -> None:
+    path = pos(tmp_path, [pos_row(START_NS + LEAP_NS + k * 10**9, lat=49 + k * 1e-6) for k in range(3)])
+    text = "\n".join(",".join(line.split()) for line in path.read_text().splitlines())
+    (tmp_path / name).write_text(text.replace("%,", "% "))
+    np.testing.assert_array_equal(read(tmp_path / name).rows, read(path).rows)
+
+
 def test_no_row_is_better_than_its_quality(tmp_path: Path) -> None:
     path = pos(
         tmp_path, [pos_row(START_NS + LEAP_NS + q * 10**9, q, "0.0040 0.9000 0.0090") for q in (1, 2, 5)]

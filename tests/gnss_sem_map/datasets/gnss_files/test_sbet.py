@@ -25,6 +25,14 @@ def test_an_sbet_finds_its_week_and_is_thinned(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.rows[0, 1:7], [49.0, 8.4, 160.0, 0.02, 0.02, 0.05])
 
 
+@pytest.mark.parametrize("name", ["out.sbet", "track.bin", "track.dat", "track.txt", "track"])
+def test_an_sbet_is_one_by_its_content(tmp_path: Path, name: str) -> None:
+    seconds = week_seconds(START_NS + LEAP_NS) + np.arange(0, 2, 0.005)
+    rows = [read(sbet(tmp_path, seconds, one), stddevs_m=(1, 1, 1)).rows for one in ("plain.sbet", name)]
+    assert len(rows[0]) == 20
+    np.testing.assert_array_equal(*rows)
+
+
 def test_an_sbet_needs_its_accuracy(tmp_path: Path) -> None:
     seconds = week_seconds(START_NS + LEAP_NS) + np.arange(0, 2, 0.005)
     path = sbet(tmp_path, seconds)

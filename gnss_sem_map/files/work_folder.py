@@ -23,9 +23,11 @@ edges/                           what the edges of ranges of chunks tell of moti
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,6 +39,8 @@ CHUNKS, MATCHES, SWEEPS, REVISITS = "chunks.json", "matches", "sweeps", "revisit
 ANSWERS, DRIVES = "answers", "drives"
 TILES, EDGES, PART, OLD = "tiles", "edges", "part", "old"
 JOB, REMOVED = "job.json", "removed.json"
+ATTEMPTS, AGAIN_S = 10, 0.2
+"""So often a folder is removed in which something is still written, so long after one another."""
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json|trajectory\.npz"
     r"|(\d+|\.\d+\.\d+\.part)/((record\.json|\w+\.npz|\w+/|\w+/-?\d+_-?\d+\.parquet)?|(\w+/)?\.[^/]+\.\d+\.part)"
@@ -168,9 +172,19 @@ def drop_results(folder: Path) -> None:
 
 
 def _remove_ours(path: Path) -> None:
-    """Remove a folder that only we write into, in a folder of ours."""
-    if path.is_dir():
-        shutil.rmtree(path)
+    """Remove a folder that only we write into, in a folder of ours.
+
+    Workers of a command that was killed just now may write there a moment longer.
+    """
+    for attempt in range(1, ATTEMPTS + 1):
+        if not path.is_dir():
+            return
+        try:
+            shutil.rmtree(path)
+        except OSError as error:
+            if error.errno != errno.ENOTEMPTY or attempt == ATTEMPTS:
+                raise
+            time.sleep(AGAIN_S)
 
 
 def _remove_known(work: Path, path: Path) -> None:

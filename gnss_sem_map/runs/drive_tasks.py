@@ -265,17 +265,21 @@ def place(folder: str, key: str, located: str, bound: str) -> dict[str, Any]:
 
 
 def _labelled(drive: OpenDrive, track: Trajectory) -> Drive:
-    """The drive in the map, with a network whose answers are kept: no image is segmented twice."""
-    job, network = drive.job, drive.network
+    """The drive in the map."""
+    job, saved = drive.job, drive.job.saved if drive.job.saved.is_dir() else None
     log = drive.log if job.origin is None else replace(drive.log, frame=job.origin)
-    made = Drive(log, track, network, job.settings, job.saved if job.saved.is_dir() else None)
-    if network is None or not log.cameras or isinstance(network, CachedLabels):
-        return made
-    sizes = log.calibration.image_sizes
-    answers = probabilities_folder(
-        job.folder, fingerprints.of_probabilities(made, job.source.labels_from), True, sizes
+    return with_answers(
+        Drive(log, track, drive.network, job.settings, saved), job.folder, job.source.labels_from
     )
-    return replace(made, segmenter=CachedSegmenter(network, made.label_set, sizes, answers))
+
+
+def with_answers(drive: Drive, folder: Path, labels_from: str) -> Drive:
+    """The drive with a network whose answers are kept in a work folder: no image is segmented twice."""
+    if drive.segmenter is None or not drive.log.cameras or isinstance(drive.segmenter, CachedLabels):
+        return drive
+    sizes = drive.log.calibration.image_sizes
+    answers = probabilities_folder(folder, fingerprints.of_probabilities(drive, labels_from), True, sizes)
+    return replace(drive, segmenter=CachedSegmenter(drive.segmenter, drive.label_set, sizes, answers))
 
 
 def map_range(folder: str, key: str, mapped: str, start: int, stop: int) -> float:

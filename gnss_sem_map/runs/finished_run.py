@@ -48,7 +48,7 @@ from gnss_sem_map.runs import pipeline, run_folder
 from gnss_sem_map.runs.about import about_map, about_skips
 from gnss_sem_map.runs.delivery import write_summary
 from gnss_sem_map.runs.drive_job import closing_drives, give, job_for
-from gnss_sem_map.runs.drive_tasks import write_map
+from gnss_sem_map.runs.drive_tasks import with_answers, write_map
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.many_drives import begin
 from gnss_sem_map.runs.map_job import MapJob
@@ -249,6 +249,7 @@ class Run:
             drive = Drive(log, run.trajectory, network, settings)
             with TemporaryDirectory(prefix=".work.", dir=folder) as work:
                 with stats.stage("mapping"):
+                    drive = with_answers(drive, Path(work) / "work", spec)
                     store = map_scans(drive, Path(work) / "work", stats, progress, labels_from=spec)
                     write_map(drive, store, folder, stats)
                 objects, untracked = store.objects(), store.untracked()

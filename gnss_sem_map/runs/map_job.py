@@ -35,6 +35,8 @@ class MapJob:
         A drive of which a task fails is left out. Of a map of one, the error is raised.
         """
         flat = [task for of_drive in tasks.values() for task in of_drive]
+        if not flat:
+            return {name: [] for name in tasks}
         # of a single one, a worker would take seconds to start
         executor = self.executor if len(flat) > 1 else InProcess()
         calls = {task if self.is_one else attempted(task): task for task in flat}

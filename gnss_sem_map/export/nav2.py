@@ -27,6 +27,8 @@ OTHER_GROUND_COST = 50
 """Least cost of ground that is neither road nor sidewalk, such as a lawn."""
 HOLLOW_M = 0.4
 """Nobody drives through a vehicle, though the LiDAR sees the ground under it, and through its windows no roof."""
+DRIVEN_M, PASSED = 0.75, 99
+"""Nothing stands within half the width of a small vehicle of where the vehicle of the map itself drove."""
 SLOPE_OVER_M = 0.5
 """The slope at a place is that from so far behind to so far ahead of it."""
 ON_GROUND, HIDES_GROUND = (Role.VEHICLE, Role.PERSON), (Role.BUILDING, Role.POLE)
@@ -108,8 +110,22 @@ def _costs(
         (shape[0] * per_cell + 2 * edge, shape[1] * per_cell + 2 * edge),
     )
     costs = _of_columns(ground, exported.nav2, size, reach, hollow)[edge:-edge, edge:-edge]
+    driven = _driven(exported, (low[0] * per_cell, low[1] * per_cell), costs.shape)
+    costs = np.where(driven & (costs == OCCUPIED), PASSED, costs)
     in_cells = costs.reshape(shape[0], per_cell, shape[1], per_cell)
     return in_cells.max(axis=(1, 3)).astype(np.uint8)  # -1, which is unknown, becomes 255
+
+
+def _driven(exported: Exported, low: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which columns the vehicle drove over."""
+    size, found = exported.map.voxel_size_m, np.zeros(shape, np.uint8)
+    wide = 2 * round(DRIVEN_M / size) + 1
+    for track in exported.tracks:
+        columns = np.floor(track.positions[:, :2] / size).astype(np.int64) - low
+        near = ((columns >= -wide) & (columns < np.array(shape) + wide)).all(axis=1)
+        for i in np.flatnonzero(near[1:] & near[:-1]).tolist():
+            cv2.line(found, columns[i, ::-1].tolist(), columns[i + 1, ::-1].tolist(), 1, wide)
+    return found > 0
 
 
 def _of_columns(

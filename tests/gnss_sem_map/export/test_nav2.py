@@ -9,6 +9,7 @@ import yaml
 from hillside import CANOPY, CAR, HEDGE, MOVED, ROAD, SIGN, SIZE, Part, exported, hillside, in_part
 from pydantic import ValidationError
 
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Nav2Settings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.export import nav2
@@ -100,6 +101,14 @@ def test_a_large_cell_is_occupied_where_any_part_of_it_is(tmp_path: Path) -> Non
     assert (cells_of(SIGN, large) == OCCUPIED).all()
     assert (large[0] == OCCUPIED).sum() >= (small[0] == OCCUPIED).sum() / 4
     np.testing.assert_allclose(large[2] / 0.4, np.round(large[2] / 0.4))
+
+
+def test_nothing_stands_where_the_vehicle_itself_drove(tmp_path: Path) -> None:
+    T = np.tile(np.eye(4), (40, 1, 1))
+    T[:, :3, 3] = np.column_stack([np.linspace(25, 35, 40), np.full(40, -0.7), np.ones(40)])
+    driven = replace(exported(), tracks=[Trajectory(np.arange(40.0), T)])
+    assert (cells_of(SIGN, written(driven, tmp_path / "nav2")) == FREE).all()
+    assert (cells_of(CAR, map_server(tmp_path / "nav2" / "map.yaml")) == OCCUPIED).all()
 
 
 def test_windows_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,7 +96,9 @@ class DeliverySettings(BaseModel):
         0.0, ge=0, le=1, description="Voxels whose label is less sure than this are written as unlabelled."
     )
     nav2: Nav2Settings = Field(Nav2Settings(), description="The robot of `export --format nav2`.")
-    terrain: TerrainSettings = Field(TerrainSettings(), description="The ground of `export --format terrain` and `nav2`.")
+    terrain: TerrainSettings = Field(
+        TerrainSettings(), description="The ground of `export --format terrain` and `nav2`."
+    )
 
 
 class Settings(BaseModel):

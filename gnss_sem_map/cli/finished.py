@@ -82,12 +82,18 @@ def export(
             help="Voxels whose label is less sure than this (0 to 1) are written as unlabelled; default: 0."
         ),
     ] = None,
+    set_: Set = None,
 ) -> None:
-    """Write the refined map of a run in some formats; in other coordinates, or cut, into a folder of their own."""
+    """Write the refined map of a run in some formats; delivered otherwise than the run into a folder of their own."""
+    from gnss_sem_map.errors import ConfigError
     from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
-    settings = delivered_in(finished.settings, crs, geoid, min_confidence)
+    if others := [each for each in set_ or () if not each.startswith("delivery.")]:
+        raise ConfigError(
+            f"export: found --set {others[0][:100]}, expected settings of `delivery`, such as delivery.nav2.step_m=0.05"
+        )
+    settings = delivered_in(finished.settings.changed(*(set_ or ())), crs, geoid, min_confidence)
     with progress_bars() as progress:
         files = finished.export(
             [name.strip() for name in formats.split(",")], out, settings.delivery, progress

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -42,8 +42,8 @@ class Exported:
     """Of its voxels; None where they are not known."""
     raw: TiledMap | None = None
     """The map before refinement, which knows how high the points lie in their voxels."""
-    nav2: Nav2Settings = Nav2Settings()
-    terrain: TerrainSettings = TerrainSettings()
+    nav2: Nav2Settings = field(default_factory=Nav2Settings)
+    terrain: TerrainSettings = field(default_factory=TerrainSettings)
 
     def tiles(self) -> Iterator[tuple[SemanticMap, Attributes | None]]:
         """The map tile by tile, with the attributes of its voxels; raises DataError."""

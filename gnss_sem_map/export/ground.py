@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.labels.roles import Role
@@ -29,6 +30,8 @@ POINT_STDDEV_M, LEAST_STDDEV_M = 0.03, 0.01
 BLOCK, AROUND, RISE, STEP_M = 4, 24, 0.05, 0.25
 """Ground that no class calls so is followed from road and sidewalk, over so many blocks of 4 x 4 columns: where nothing
 is seen between, it may rise by this slope. At the edge of what was seen, the lowest of a hedge is not its foot."""
+GHOSTS, DEEP_M = 4, 1.0
+"""What is so deep under road and sidewalk in the 5 x 5 blocks around, leaving out so many of these, is a reflection."""
 GROWTH = 0.05
 """Standard deviation, m, per metre to the nearest cell where the ground was seen."""
 WINDOW = 1024
@@ -78,14 +81,19 @@ def ground_of(exported: Exported, low: tuple[int, int], shape: tuple[int, int]) 
     standing = _standing(exported.measured, first, end)
     voxels, surfaces = standing.voxels, standing.voxels.surface_heights
     surfaces = np.where(np.isnan(surfaces), voxels.centres[:, 2], surfaces)
-    over, is_ground = _told_apart(exported, standing, surfaces)
+    is_ghost, over, is_ground = _told_apart(exported, standing, surfaces)
     x, y = (voxels.indices[:, :2] - first).astype(np.int64).T
-    inside, (m, n) = (x >= 0) & (x < end[0] - first[0]) & (y >= 0) & (y < end[1] - first[1]), (end - first).tolist()
+    inside, (m, n) = (
+        (x >= 0) & (x < end[0] - first[0]) & (y >= 0) & (y < end[1] - first[1]),
+        (end - first).tolist(),
+    )
     chosen = np.flatnonzero(inside & is_ground)
     columns, hits = x[chosen] * n + y[chosen], voxels.hits[chosen]
     points = np.bincount(columns, hits, m * n).reshape(m, n).astype(np.float32)
     total = np.bincount(columns, hits * surfaces[chosen], m * n).reshape(m, n)
-    measured = np.divide(total, points, out=np.zeros((m, n), np.float32), where=points > 0, casting="same_kind")
+    measured = np.divide(
+        total, points, out=np.zeros((m, n), np.float32), where=points > 0, casting="same_kind"
+    )
     filled, _ = _filled(measured, (points > 0).astype(np.float32), levels)
     far = cv2.distanceTransform((points == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     inner = tuple(slice(start, start + length) for start, length in zip(low - first, shape, strict=True))
@@ -93,7 +101,7 @@ def ground_of(exported: Exported, low: tuple[int, int], shape: tuple[int, int]) 
     heights[far_m > farthest_m] = np.nan
     doubt = np.where(points > 0, POINT_STDDEV_M / np.sqrt(np.maximum(points, 1)), GROWTH * far_m)
     x, y = x - inner[0].start, y - inner[1].start
-    chosen = np.flatnonzero((x >= 0) & (x < shape[0]) & (y >= 0) & (y < shape[1]))
+    chosen = np.flatnonzero(~is_ghost & (x >= 0) & (x < shape[0]) & (y >= 0) & (y < shape[1]))
     columns, tops = x[chosen] * shape[1] + y[chosen], np.full(shape, np.nan, np.float32)
     tops.reshape(-1)[columns] = surfaces[chosen]  # in order of height: of a column the highest stays
     return Ground(
@@ -121,23 +129,39 @@ def _standing(tiled_map: TiledMap, first: NDArray[np.int64], end: NDArray[np.int
 
 def _told_apart(
     exported: Exported, standing: SemanticMap, surfaces: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which voxels (v,) are over the ground, and which are ground: neither called anything else nor out of reach."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which voxels (v,) are reflections from below, which are over the ground, and which are ground."""
     voxels, label_set = standing.voxels, exported.map.label_set
-    over = over_ground(voxels, heights := height_over_ground(voxels.centres))
-    is_ground = ~over & (heights > -OVER_M) & ~np.isin(standing.labels, label_set.having(*STANDING))
-    known, ways = is_ground, label_set.having(*WAYS)
+    is_way = np.isin(standing.labels, ways := label_set.having(*WAYS))
     if exported.extent.labels[ways].sum() > exported.extent.inferred:  # images show some
-        known = is_ground & np.isin(standing.labels, ways) & ~standing.inferred
+        is_way &= ~standing.inferred
     blocks = voxels.indices[:, :2] // BLOCK
-    low = blocks.min(axis=0, initial=1 << 30) - 1
-    x, y = (blocks - low).T
+    x, y = (blocks - (blocks.min(axis=0, initial=1 << 30) - 1)).T
     shape = (int(x.max(initial=0)) + 2, int(y.max(initial=0)) + 2)
-    lowest = np.full((2, *shape), np.inf, np.float32)
-    for its, chosen in zip(lowest, (known, is_ground), strict=True):
-        np.minimum.at(its, (x[chosen], y[chosen]), surfaces[chosen])
-    highest = _followed(*lowest, exported.map.voxel_size_m)
-    return over, is_ground & (surfaces < highest[x, y] + STEP_M)
+    ways_m = ndimage.rank_filter(_lowest(x, y, shape, surfaces, is_way), GHOSTS, size=5)
+    is_ghost = surfaces < np.where(np.isinf(ways_m), -np.inf, ways_m - np.float32(DEEP_M))[x, y]
+    stands, over, heights = np.flatnonzero(~is_ghost), is_ghost.copy(), np.zeros(len(x), np.float32)
+    heights[stands] = height_over_ground(voxels.centres[stands])
+    over[stands] = over_ground(voxels[stands], heights[stands])
+    # of a kerb, the upper edge lies in a voxel over the lower one
+    is_ground = (~over | np.isin(standing.labels, ways)) & (np.abs(heights) < OVER_M)
+    is_ground &= ~is_ghost & ~np.isin(standing.labels, label_set.having(*STANDING))
+    known = is_ground & is_way if exported.extent.labels[ways].any() else is_ground
+    highest = _followed(
+        *(_lowest(x, y, shape, surfaces, each) for each in (known, is_ground)), exported.map.voxel_size_m
+    )
+    is_ground &= surfaces < highest[x, y] + STEP_M
+    return is_ghost, over & ~is_ground, is_ground
+
+
+def _lowest(
+    x: NDArray[np.int32], y: NDArray[np.int32], shape: tuple[int, int], surfaces: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+) -> Heights:  # fmt: skip
+    """The lowest of the chosen surfaces in every block; infinite where none is."""
+    lowest = np.full(shape, np.inf, np.float32)
+    np.minimum.at(lowest, (x[chosen], y[chosen]), surfaces[chosen])
+    return lowest
 
 
 def _followed(known: Heights, lowest: Heights, size: float) -> Heights:
@@ -150,7 +174,7 @@ def _followed(known: Heights, lowest: Heights, size: float) -> Heights:
 
 
 def _filled(values: Heights, weights: Heights, levels: int) -> tuple[Heights, Heights]:
-    """Values with those of weight 0 interpolated from means of 2 x 2, of 4 x 4 and so on; weight 0 where none is near."""
+    """Values, those of weight 0 interpolated from means of 2 x 2, 4 x 4 and so on; weight 0 where none is near."""
     if not levels:
         return values, weights
     wide, high = values.shape[::-1]
@@ -158,9 +182,7 @@ def _filled(values: Heights, weights: Heights, levels: int) -> tuple[Heights, He
         np.dstack([values * weights, weights]), (wide // 2, high // 2), interpolation=cv2.INTER_AREA
     )
     coarse, known = _filled(_ratio(pulled), np.ascontiguousarray(pulled[..., 1]), levels - 1)
-    pushed = cv2.resize(
-        np.dstack([coarse * known, known]), (wide, high), interpolation=cv2.INTER_LINEAR
-    )
+    pushed = cv2.resize(np.dstack([coarse * known, known]), (wide, high), interpolation=cv2.INTER_LINEAR)
     is_known = weights > 0
     return np.where(is_known, values, _ratio(pushed)), np.where(is_known, weights, pushed[..., 1])
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,10 +25,14 @@ PIXELS = np.full(256, 254, np.uint8)
 PIXELS[OCCUPIED], PIXELS[UNKNOWN] = 0, 205
 OTHER_GROUND_COST = 50
 """Least cost of ground that is neither road nor sidewalk, such as a lawn."""
+HOLLOW_M = 0.4
+"""Nobody drives through a vehicle, though the LiDAR sees the ground under it, and through its windows no roof."""
+DRIVEN_M, PASSED = 0.75, 99
+"""Nothing stands within half the width of a small vehicle of where the vehicle of the map itself drove."""
 SLOPE_OVER_M = 0.5
 """The slope at a place is that from so far behind to so far ahead of it."""
-FILLS_COLUMN = (Role.VEHICLE, Role.PERSON, Role.BUILDING, Role.POLE)
-"""Roles of what reaches down to the ground, where that is not seen under it."""
+ON_GROUND, HIDES_GROUND = (Role.VEHICLE, Role.PERSON), (Role.BUILDING, Role.POLE)
+"""Roles of what always reaches down to the ground, and of what does where that is not seen under it."""
 
 
 def write_nav2(exported: Exported, folder: Path) -> None:
@@ -97,19 +102,36 @@ def _costs(
 ) -> NDArray[np.uint8]:
     """Costs of `shape` cells from `low` on."""
     size = exported.map.voxel_size_m
-    reach = max(2, round(SLOPE_OVER_M / size))
+    reach, hollow = max(1, round(SLOPE_OVER_M / size)), round(HOLLOW_M / size)
+    edge = 2 + max(reach, 2 * hollow)
     ground = ground_of(
         exported,
-        (low[0] * per_cell - reach, low[1] * per_cell - reach),
-        (shape[0] * per_cell + 2 * reach, shape[1] * per_cell + 2 * reach),
+        (low[0] * per_cell - edge, low[1] * per_cell - edge),
+        (shape[0] * per_cell + 2 * edge, shape[1] * per_cell + 2 * edge),
     )
-    costs = _of_columns(ground, exported.nav2, size, reach)[reach:-reach, reach:-reach]
+    costs = _of_columns(ground, exported.nav2, size, reach, hollow)[edge:-edge, edge:-edge]
+    driven = _driven(exported, (low[0] * per_cell, low[1] * per_cell), costs.shape)
+    costs = np.where(driven & (costs == OCCUPIED), PASSED, costs)
     in_cells = costs.reshape(shape[0], per_cell, shape[1], per_cell)
     return in_cells.max(axis=(1, 3)).astype(np.uint8)  # -1, which is unknown, becomes 255
 
 
-def _of_columns(ground: Ground, settings: Nav2Settings, size: float, reach: int) -> NDArray[np.int16]:
-    """Cost of every column, -1 where it is unknown; wrong within `reach` of the edge."""
+def _driven(exported: Exported, low: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which columns the vehicle drove over."""
+    size, found = exported.map.voxel_size_m, np.zeros(shape, np.uint8)
+    wide = 2 * round(DRIVEN_M / size) + 1
+    for track in exported.tracks:
+        columns = np.floor(track.positions[:, :2] / size).astype(np.int64) - low
+        near = ((columns >= -wide) & (columns < np.array(shape) + wide)).all(axis=1)
+        for i in np.flatnonzero(near[1:] & near[:-1]).tolist():
+            cv2.line(found, columns[i, ::-1].tolist(), columns[i + 1, ::-1].tolist(), 1, wide)
+    return found > 0
+
+
+def _of_columns(
+    ground: Ground, settings: Nav2Settings, size: float, reach: int, hollow: int
+) -> NDArray[np.int16]:
+    """Cost of every column, -1 where it is unknown; wrong near the edge."""
     labels, label_set = ground.standing.labels, ground.standing.voxels.label_set
     costs = np.full(ground.seen.size, -1, np.int16)
     costs[ground.seen.ravel()] = OTHER_GROUND_COST
@@ -123,19 +145,28 @@ def _of_columns(ground: Ground, settings: Nav2Settings, size: float, reach: int)
     known = np.flatnonzero((costs >= 0) & np.isfinite(ratio))
     worst = np.where(ratio[known] > 1, OCCUPIED, 99 * ratio[known]).astype(np.int16)
     costs[known] = np.maximum(costs[known], worst)
-    in_the_way = ground.over & (ground.above > settings.step_m) & (ground.above < settings.robot_height_m)
-    hidden = ~ground.seen.ravel()[ground.columns] & np.isin(labels, label_set.having(*FILLS_COLUMN))
-    costs[ground.columns[in_the_way | hidden]] = OCCUPIED
+    in_the_way = (ground.above > settings.step_m) & (ground.above < settings.robot_height_m)
+    below = np.isin(labels, label_set.having(*HIDES_GROUND)) & ~ground.seen.ravel()[ground.columns]
+    costs[ground.columns[ground.over & (in_the_way | below)]] = OCCUPIED
+    bodies = np.zeros(costs.size, np.uint8)
+    is_body = ground.over & np.isin(labels, label_set.having(*ON_GROUND)) & (ground.above > settings.step_m)
+    bodies[ground.columns[is_body]] = 1
+    around = np.ones((2 * hollow + 1, 2 * hollow + 1), np.uint8)
+    bodies = cv2.morphologyEx(bodies.reshape(ground.seen.shape), cv2.MORPH_CLOSE, around)
+    costs[bodies.ravel() > 0] = OCCUPIED
     return costs.reshape(ground.seen.shape)
 
 
 def _slopes(
     heights: NDArray[np.float32], size: float, reach: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Slope (rise over run) of every column, and the greatest rise from the column before it to that behind it."""
+    """Slope (rise over run) of every column, and the rise from the column before it to that behind it, at edges."""
     slope, step = np.zeros_like(heights), np.zeros_like(heights)
     for axis in (0, 1):
         rise = np.roll(heights, -reach, axis) - np.roll(heights, reach, axis)
         slope = np.hypot(slope, rise / np.float32(2 * reach * size))
-        step = np.fmax(step, np.abs(np.roll(heights, -1, axis) - np.roll(heights, 1, axis)))
+        across = np.abs(np.roll(heights, -1, axis) - np.roll(heights, 1, axis))
+        before, behind = np.roll(across, 1, axis), np.roll(across, -1, axis)
+        is_edge = (across > before) & (across >= behind)  # and not beside one
+        step = np.where(is_edge, np.fmax(step, across), step)
     return slope, step

@@ -63,7 +63,10 @@ def _blocks(
     for i, j in np.ndindex(-(-rows // BLOCKS_AT_ONCE), -(-columns // BLOCKS_AT_ONCE)):
         i, j = i * BLOCKS_AT_ONCE, j * BLOCKS_AT_ONCE
         part = corners.places[i : i + BLOCKS_AT_ONCE + 1, j : j + BLOCKS_AT_ONCE + 1] * cells.per_cell
-        first, end = np.floor(part.min(axis=(0, 1))).astype(int) - 1, np.ceil(part.max(axis=(0, 1))).astype(int) + 1
+        first, end = (
+            np.floor(part.min(axis=(0, 1))).astype(int) - 1,
+            np.ceil(part.max(axis=(0, 1))).astype(int) + 1,
+        )
         low = cells.west * cells.per_cell + int(first[1]), cells.north * cells.per_cell - int(end[0])
         bands = _bands(exported, low, (int(end[1] - first[1]), int(end[0] - first[0])))
         for k, m in np.ndindex(*(np.array(part.shape[:2]) - 1)):
@@ -90,8 +93,6 @@ def _sampled(bands: list[Heights], places: Heights, lift_m: NDArray[np.float64])
     import cv2
 
     right, down = np.ascontiguousarray(places[..., 1]), np.ascontiguousarray(places[..., 0])
-    heights, stddevs = (
-        cv2.remap(band, right, down, cv2.INTER_LINEAR, borderValue=np.nan) for band in bands
-    )
+    heights, stddevs = (cv2.remap(band, right, down, cv2.INTER_LINEAR, borderValue=np.nan) for band in bands)
     found = np.stack([heights + lift_m.astype(np.float32), stddevs])
     return np.where(np.isnan(found[:1]), np.float32(NODATA), found).astype(np.float32)

@@ -308,8 +308,8 @@ class Run:
         """What is exported, delivered so; files inside the run are delivered as the run says."""
         if is_inside and delivery not in (None, self.settings.delivery):
             raise ConfigError(
-                "export: other coordinates, or another least confidence, than those of the run need a folder of their"
-                " own: -o DIR"
+                "export: other coordinates, or another least confidence, robot or terrain, than those of the run need a"
+                " folder of their own: -o DIR"
             )
         about, delivery = self.about, delivery or self.settings.delivery
         check_delivery(delivery.crs, delivery.geoid)

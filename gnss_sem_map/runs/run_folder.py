@@ -163,7 +163,9 @@ def exported_of(
     """What is exported of a run folder; without `label_set`, the classes are those that its map names."""
     refined = tiles.open_map(folder / REFINED, label_set, with_sums=False)
     refined = sure_part(refined, delivery.min_confidence)
-    raw = tiles.open_map(folder / MAP, refined.label_set, with_sums=False) if is_folder(folder / MAP) else None
+    raw = (
+        tiles.open_map(folder / MAP, refined.label_set, with_sums=False) if is_folder(folder / MAP) else None
+    )
     return Exported(
         refined, tracks, title, changes, delivery.crs, delivery.geoid, open_attributes(folder), raw,
         delivery.nav2, delivery.terrain,

@@ -90,6 +90,7 @@ def test_what_text_calls_a_command_is_one(code: str) -> None:
         assert path.is_dir() or all(f'"{option}"' in path.read_text("utf-8") for option in options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "block", [block for block in BLOCKS if block.language == "python"], ids=lambda b: b.page
 )

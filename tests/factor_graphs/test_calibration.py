@@ -80,7 +80,7 @@ def test_covariances_hold_what_is_not_known_of_clock_and_lever_arm(simulate):
     np.testing.assert_allclose(found.keyframes.position_covariances, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("scale", [1.01, 0.97])
+@pytest.mark.parametrize("scale", [1.01, pytest.param(0.97, marks=pytest.mark.slow)])
 def test_a_gyroscope_that_turns_too_much_is_found(simulate, scale):
     drive = simulate(66, seconds=300.0, noise=ImuNoise(), moves=on_its_side)
     wrong = ImuSamples(drive.imu.stamps, drive.imu.specific_force, scale * drive.imu.angular_rate)
@@ -100,7 +100,7 @@ def on_its_side(seconds, rng):
     return Mounted(random_drive(seconds, rng), T)
 
 
-@pytest.mark.parametrize("stddev", [0.02, 1.0])
+@pytest.mark.parametrize("stddev", [pytest.param(0.02, marks=pytest.mark.slow), 1.0])
 def test_a_step_of_the_receivers_clock_is_found_where_it_is(simulate, stddev):
     drive = simulate(67, seconds=300.0, noise=ImuNoise())
     fixes = simulate_gnss(drive.motion, drive.fixes.stamps, stddev, LEVER, np.random.default_rng(0))

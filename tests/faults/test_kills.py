@@ -66,7 +66,7 @@ def neighbours(folder: Path) -> dict[str, str]:
     return content(folder)
 
 
-@pytest.mark.parametrize("listed", [True, False])
+@pytest.mark.parametrize("listed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_result_is_replaced_whole_whenever_it_is_killed(
     results, listed: bool, trial, tmp_path: Path
 ) -> None:
@@ -147,6 +147,7 @@ def kill_the_mapping(
     assert number > 30
 
 
+@pytest.mark.slow
 def test_a_mapping_that_is_killed_goes_on_to_the_same_bytes(
     small_drive, at_once, trial, tmp_path: Path
 ) -> None:
@@ -180,6 +181,7 @@ def kill_the_clean_up(small_drive: Street, at_once, trial, folder: Path, step: i
     assert number > 15
 
 
+@pytest.mark.slow
 def test_a_clean_up_that_is_killed_is_not_mistaken_for_work(
     small_drive, at_once, trial, tmp_path: Path
 ) -> None:
@@ -230,6 +232,7 @@ def kill_a_run(small_drive: Street, whole, trial, folder: Path, after_s: float) 
     trial("kill a run", faults, outcome)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_and_resumed_gives_the_same_bytes(
     small_drive, whole, trial, tmp_path: Path
 ) -> None:

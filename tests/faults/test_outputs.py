@@ -43,7 +43,7 @@ FOREIGN: dict[str, Callable[[Path], None]] = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-@pytest.mark.parametrize("listed", [True, False])
+@pytest.mark.parametrize("listed", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "command",
     ["trajectory", *(pytest.param(name, marks=pytest.mark.faults) for name in ("run", "demo"))],
@@ -103,7 +103,7 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("place", INPUTS)
-@pytest.mark.parametrize("linked", [False, True])
+@pytest.mark.parametrize("linked", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_input_is_never_a_place_for_results(
     own_street: Street, place: str, linked: bool, trial, tmp_path: Path
 ) -> None:

@@ -84,7 +84,7 @@ def test_a_task_maps_the_bytes_of_this_process(
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize("workers", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_processes_map_the_bytes_of_this_process(
     drive: Drive, source: Source, expected: dict[str, bytes], tmp_path: Path, workers: int
 ) -> None:

@@ -73,7 +73,14 @@ def test_processes_find_the_same(
 
 @pytest.mark.parametrize(
     ("file", "damage"),
-    [("1.npz", b""), ("1.npz", b"no archive"), ("1.json", b"[]"), ("1.json", b"{"), ("1.json", b"{}")],
+    [
+        ("1.npz", b"no archive"),
+        ("1.json", b"{"),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in (("1.npz", b""), ("1.json", b"[]"), ("1.json", b"{}"))
+        ),
+    ],
 )
 def test_an_interrupted_run_matches_only_what_is_missing_or_damaged(
     small_log: SensorLog, small_track: Trajectory, expected: ScanMatches, small_source: Source, tmp_path: Path,

@@ -73,7 +73,9 @@ def test_other_processes_find_the_same(
     assert not (tmp_path / "w").exists()
 
 
-@pytest.mark.parametrize("damage", [b"", b"[]", b"{", b"{}"])
+@pytest.mark.parametrize(
+    "damage", [b"{", *(pytest.param(one, marks=pytest.mark.slow) for one in (b"", b"[]", b"{}"))]
+)
 def test_only_what_is_missing_or_damaged_is_registered_again(
     small_log: SensorLog, small_track: Trajectory, small_source: Source, places: Pass, expected: list[Found | None],
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: bytes,

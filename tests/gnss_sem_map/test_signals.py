@@ -73,11 +73,11 @@ except Stopped as stopped:
     ("place", "printed"),
     [
         ("interrupt", "15"),
-        ("InFinalizer", "15"),
+        pytest.param("InFinalizer", "15", marks=pytest.mark.slow),
         ("in_a_callback", "15"),
         ("while_a_lock_is_taken", "given back 15"),
-        ("while_a_member_is_opened", "15"),
-        ("while_a_plot_is_drawn", "15"),
+        pytest.param("while_a_member_is_opened", "15", marks=pytest.mark.slow),
+        pytest.param("while_a_plot_is_drawn", "15", marks=pytest.mark.slow),
         ("while_it_waits", "15"),
     ],
 )

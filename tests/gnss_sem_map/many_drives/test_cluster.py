@@ -15,7 +15,7 @@ from processes import wait_until
 from street_drives import Drives
 
 pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
 
 def test_a_run_whose_command_is_killed_is_resumed_while_workers_are_still_busy(

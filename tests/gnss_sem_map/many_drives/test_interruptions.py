@@ -83,6 +83,7 @@ def stop_of(run: Callable[[], object], module: ModuleType, name: str) -> Keyboar
     return stopping.value
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_in_its_first_drive_keeps_the_chunks(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -145,6 +146,7 @@ def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(
         assert len(calls) == times
 
 
+@pytest.mark.slow
 def test_what_is_damaged_of_an_interrupted_run_is_made_again(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -190,7 +192,8 @@ def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
     assert not work.exists()
 
 
-@pytest.mark.parametrize("names", ["a", pytest.param("ab", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("names", ["a", "ab"])
 def test_a_run_that_was_stopped_when_the_map_was_there_does_nothing_twice(
     names: str, made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -250,6 +253,7 @@ def call_of_map_one(drives: Drives, work: Path) -> tuple[Path, Path, tuple[Any, 
     return settings, folder, (asdict(source), str(settings), astuple(frame), str(folder), True, "")
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Drives, tmp_path: Path) -> None:
     """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
     _, folder, words = call_of_map_one(drives, tmp_path)
@@ -276,6 +280,7 @@ def test_a_call_that_waited_until_another_run_had_begun_does_nothing(drives: Dri
     assert not folder.exists()
 
 
+@pytest.mark.slow
 def test_a_run_does_not_begin_anew_while_a_task_of_an_earlier_one_still_writes(
     drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -306,6 +311,7 @@ def test_a_removal_that_was_stopped_when_the_map_was_there_does_nothing_twice(
         remove_drive(out, "c", resume=True)
 
 
+@pytest.mark.slow
 def test_a_name_that_is_not_in_the_map_leaves_what_another_command_has_done(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:

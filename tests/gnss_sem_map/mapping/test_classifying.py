@@ -18,7 +18,7 @@ from street import Street
 from street_drives import Drives
 from typer.testing import CliRunner
 
-from gnss_sem_map import Run, Settings, config, run
+from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import classifying, refining
@@ -33,7 +33,6 @@ from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 pytestmark = pytest.mark.integration
 CLASSIFIER = Path("evidence", FILE)
-PAPER = Path(__file__).parents[3] / "examples" / "paper.yaml"
 
 
 def refined(out: Path) -> dict[str, bytes]:
@@ -102,12 +101,14 @@ def test_voxels_that_no_image_shows_get_the_class_they_have(street_run: Run) -> 
     assert ((found.confidence > 0) == (found.labels >= 0)).all()
 
 
+@pytest.mark.slow
 def test_a_run_refined_again_with_the_same_settings_is_the_same(street_run: Run, tmp_path: Path) -> None:
     again = street_run.refine(street_run.settings, tmp_path / "again")
     assert refined(again.folder) == refined(street_run.folder)
     assert (again.folder / CLASSIFIER).read_bytes() == (street_run.folder / CLASSIFIER).read_bytes()
 
 
+@pytest.mark.slow
 def test_switched_off_and_on_again(street_run: Run, tmp_path: Path) -> None:
     out = Path(shutil.copytree(street_run.folder, tmp_path / "out"))
     for value in ("false", "true"):
@@ -121,6 +122,7 @@ def test_switched_off_and_on_again(street_run: Run, tmp_path: Path) -> None:
     assert refined(out) == refined(street_run.folder)
 
 
+@pytest.mark.slow
 def test_a_damaged_classifier_is_made_again(street_run: Run, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(street_run.folder, tmp_path / "copy"))
     damage.halved(copy / CLASSIFIER)
@@ -129,6 +131,7 @@ def test_a_damaged_classifier_is_made_again(street_run: Run, tmp_path: Path) -> 
     assert refined(out) == refined(street_run.folder)
 
 
+@pytest.mark.slow
 def test_a_named_classifier_is_used_in_place_of_the_own_one(
     street_run: Run, model: Path, tmp_path: Path
 ) -> None:
@@ -151,6 +154,7 @@ def test_a_named_classifier_is_used_in_place_of_the_own_one(
     assert tiles_of(again.folder) == found[other], "the run has its own copy"
 
 
+@pytest.mark.slow
 def test_without_labels_of_images_a_named_classifier_gives_all_classes(
     street_run: Run, model: Path, tmp_path: Path
 ) -> None:
@@ -173,6 +177,7 @@ def test_without_labels_of_images_a_named_classifier_gives_all_classes(
     assert refined(made.folder) == refined(named.folder)
 
 
+@pytest.mark.slow
 def test_a_classifier_of_intensities_is_left_out_where_there_are_none(
     plain_run: Run, street_run: Run, model: Path, tmp_path: Path
 ) -> None:
@@ -190,6 +195,7 @@ def test_a_classifier_of_intensities_is_left_out_where_there_are_none(
     assert refined(own.folder) == refined(plain_run.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size_m", [3.0, 0.2])
 def test_too_few_labels_and_one_class_are_said_and_all_else_is_as_without(
     size_m: float, small_drive: Street, tmp_path: Path
@@ -221,7 +227,8 @@ def test_too_few_labels_and_one_class_are_said_and_all_else_is_as_without(
         np.testing.assert_array_equal(getattr(whole.map(), name), getattr(without.map(), name))
 
 
-@pytest.mark.parametrize("unit", [0.1, pytest.param(0.01, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [0.1, 0.01])
 def test_intensities_of_another_scale_have_the_same_ranks_as_far_as_they_are_told_apart(
     unit: float, street_run: Run, small_drive: Street, tmp_path: Path
 ) -> None:
@@ -272,21 +279,6 @@ def test_a_classifier_that_does_not_fit_is_refused_before_the_work(
         run(small_drive.drive, tmp_path / "out", f"labels:{small_drive.labels}", settings, force=True)
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_the_paper_s_settings_infer_nothing(small_drive: Street, tmp_path: Path) -> None:
-    settings = config.load(PAPER)
-    assert not settings.geometric_classifier.enabled
-    done = run(
-        small_drive.drive,
-        tmp_path / "out",
-        f"labels:{small_drive.labels}",
-        settings,
-        frames="0:6",
-        force=True,
-    )
-    assert not inferred(done.map()).any()
-    assert not (done.folder / CLASSIFIER).exists()
 
 
 @pytest.fixture(scope="module")
@@ -372,6 +364,7 @@ def test_drives_of_one_kind_make_one_classifier_and_others_are_refused(
     assert file.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_runs_without_labels_teach_nothing(street_run: Run, tmp_path: Path) -> None:
     drive = Path(street_run.about["inputs"]["drive"])
     bare = run(drive, tmp_path / "bare", force=True, frames="0:6")

@@ -9,7 +9,7 @@ from gnss_sem_map.simulation.ground import inside_block
 from gnss_sem_map.simulation.surfaces import Surface
 
 Floats = npt.NDArray[np.float64]
-SEEDS = [0, 1, 2, 3]
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))]
 
 
 @pytest.fixture(scope="module", params=SEEDS)

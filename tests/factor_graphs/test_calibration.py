@@ -25,7 +25,7 @@ def precise(drive, offset: float) -> GnssFixes:
     )
 
 
-@pytest.mark.parametrize("offset", [0.1, -0.04])
+@pytest.mark.parametrize("offset", [pytest.param(0.1, marks=pytest.mark.slow), -0.04])
 def test_a_time_offset_is_found_unasked_where_the_data_leave_no_doubt(simulate, offset):
     drive = simulate(60, seconds=180.0, noise=ImuNoise())
     s = smooth(drive.imu, precise(drive, offset), FRAME, None, LEVER)
@@ -43,6 +43,7 @@ def test_where_there_is_no_offset_none_is_applied(simulate):
         assert s.calibration.time_offset_s == 0.0
 
 
+@pytest.mark.slow
 def test_a_time_offset_is_left_alone_when_it_shall_be(simulate):
     drive = simulate(60, seconds=180.0, noise=ImuNoise())
     s = smooth(drive.imu, precise(drive, 0.1), FRAME, SmootherSettings(estimate_time_offset=False), LEVER)

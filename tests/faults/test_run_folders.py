@@ -98,7 +98,11 @@ def _damaged(out: Path, name: str, damage: Callable[[Path], None], folder: Path)
     return copy
 
 
-@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize(
+    "damage",
+    [_cut, *(pytest.param(damage, marks=pytest.mark.slow) for damage in DAMAGES[1:])],
+    ids=[damage.__name__ for damage in DAMAGES],
+)
 @pytest.mark.parametrize("name", FILES)
 def test_a_damaged_run_gives_our_own_errors(name, damage, made, trial, tmp_path: Path) -> None:
     out, truth = made

@@ -157,6 +157,7 @@ def test_moving_the_image_by_a_stride_moves_the_logits() -> None:
     torch.testing.assert_close(second[..., middle], first[..., middle + 8], rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_network_that_is_told_its_classes_learns_one_picture() -> None:
     network = LightWeightRefineNet(3, "mobilenet_v2", width=24, depth_head=False).train()
     images = torch.zeros(2, 3, 64, 96)

@@ -133,6 +133,7 @@ def test_an_odometry_sequence_becomes_a_map(small_drive: Street, tmp_path: Path)
     assert laspy.read(tmp_path / "out/map.laz").header.parse_crs() is None
 
 
+@pytest.mark.slow
 def test_a_table_log_becomes_a_map(small_drive: Street, tmp_path: Path) -> None:
     drive = street.write_table_log(tmp_path, small_drive)
     run(drive, small_drive.labels, tmp_path / "out")

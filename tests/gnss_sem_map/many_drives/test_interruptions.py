@@ -110,6 +110,7 @@ def calls_of_the_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return calls
 
 
+@pytest.mark.slow
 def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -62,14 +62,14 @@ def test_radians_lie_at_sea(right: SensorLog) -> None:
     assert "radians" in said[0]
 
 
-@pytest.mark.parametrize("height", [115.0, 3.0, -20.0])
+@pytest.mark.parametrize("height", [3.0, *(pytest.param(m, marks=pytest.mark.slow) for m in (115.0, -20.0))])
 def test_heights_in_millimetres_are_no_road(right: SensorLog, height: float) -> None:
     lat, lon, alt = FRAME.to_geodetic(fixes_of(right).positions)
     said = wrong(findings(written(right, lat, lon, 1000.0 * (alt - FRAME.alt_m + height))))
     assert any("altitude is in mm" in line for line in said)
 
 
-@pytest.mark.parametrize("late_s", [-1.0, 0.5, 2.0])
+@pytest.mark.parametrize("late_s", [-1.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.5, 2.0))])
 def test_a_late_clock_is_found_and_its_setting_mends_it(right: SensorLog, late_s: float) -> None:
     fixes = fixes_of(right)
     late = replace(right, gnss=GnssFixes(fixes.stamps + late_s, fixes.positions, fixes.stddevs))
@@ -137,7 +137,15 @@ def test_a_frozen_receiver_is_told_from_a_standing_vehicle(
     assert any("frozen" in line for line in said)
 
 
-@pytest.mark.parametrize(("per_degree", "is_coarse"), [(1e5, True), (6e4, True), (6e5, False), (1e8, False)])
+@pytest.mark.parametrize(
+    ("per_degree", "is_coarse"),
+    [
+        (1e5, True),
+        (6e5, False),
+        pytest.param(6e4, True, marks=pytest.mark.slow),
+        pytest.param(1e8, False, marks=pytest.mark.slow),
+    ],
+)
 def test_rounded_degrees_are_not_called_frozen(right: SensorLog, per_degree: float, is_coarse: bool) -> None:
     """Five fixes a second, of which several have the same place at 10 km/h; four or five decimals are told."""
     seen = fixes_of(right)
@@ -163,7 +171,7 @@ def test_a_receiver_that_holds_its_place_while_the_vehicle_stands_is_not_frozen(
     assert not any("frozen" in line for line in wrong(findings(replace(held, imu=still))))
 
 
-@pytest.mark.parametrize("factor", [0.01, 0.001])
+@pytest.mark.parametrize("factor", [0.01, pytest.param(0.001, marks=pytest.mark.slow)])
 def test_standard_deviations_that_nobody_reaches_are_told_of(right: SensorLog, factor: float) -> None:
     fixes = fixes_of(right)
     sure = replace(right, gnss=GnssFixes(fixes.stamps, fixes.positions, fixes.stddevs * factor))

@@ -341,7 +341,7 @@ def test_a_drive_with_images_and_no_segmenter_is_told_its_choices(
 
 
 def test_the_settings_that_are_printed_are_those_of_the_run(raw_run: Path) -> None:
-    assert gnss_sem_map("config").stdout == (raw_run / "config.yaml").read_text()
+    assert gnss_sem_map("config", *SOON).stdout == (raw_run / "config.yaml").read_text()
 
 
 def test_help_loads_nothing_heavy() -> None:

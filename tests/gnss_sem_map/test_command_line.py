@@ -229,7 +229,7 @@ def test_ctrl_c_is_one_line_from_the_first_import_on(
     process.stdout.readline()
     time.sleep(after_s)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=600)
     assert process.returncode == 130
     assert len(said.splitlines()) == 1
     assert said.startswith("gnss-sem-map: stopped by SIGINT")

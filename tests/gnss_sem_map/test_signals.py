@@ -99,7 +99,7 @@ def test_an_import_is_finished_first(tmp_path: Path) -> None:
         "except Stopped as stopped:\n    print(stopped.number, len(sys.modules['halfway'].numbers))\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=600
     )
     assert done.stdout.split() == [str(int(signal.SIGTERM)), "100000"]
 
@@ -135,7 +135,7 @@ def test_a_signal_while_a_function_is_compiled_or_loaded_crashes_nothing(tmp_pat
             capture_output=True,
             text=True,
             check=False,
-            timeout=300,
+            timeout=600,
         )
         assert (ended.returncode, ended.stdout.split(), ended.stderr) == (0, ["15"], "")
 
@@ -189,7 +189,7 @@ for line in range(1, lines + 1):
 
 def test_a_signal_at_any_line_of_claiming_a_folder_leaves_no_lock_and_no_work_folder(tmp_path: Path) -> None:
     program = [sys.executable, "-c", CLAIM, str(tmp_path)]
-    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=300)
+    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=600)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "out/result").is_file()
 
@@ -217,6 +217,6 @@ main()
 
 def test_an_error_that_a_signal_caused_is_that_signal() -> None:
     program = [sys.executable, "-c", SWALLOWED]
-    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=60)
+    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=600)
     assert ended.returncode == 128 + signal.SIGTERM
     assert ended.stderr == "gnss-sem-map: stopped by SIGTERM; what was done is kept\n"

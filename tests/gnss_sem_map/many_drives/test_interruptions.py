@@ -275,7 +275,7 @@ def test_a_call_that_waited_until_another_run_had_begun_does_nothing(drives: Dri
         waiting.join(1.0)
         assert waiting.is_alive()
         settings.unlink()
-    waiting.join(30.0)
+    waiting.join(600.0)
     (reason,) = answers
     assert reason == f"{settings}: is gone; this task is of a run that has ended"
     assert not folder.exists()

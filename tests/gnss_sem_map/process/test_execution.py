@@ -242,7 +242,7 @@ def test_a_script_without_a_guard_gets_an_error_and_does_not_hang(tmp_path: Path
     script = tmp_path / "script.py"
     script.write_text(PARENT.replace('if __name__ == "__main__":', "if True:"))
     words = [sys.executable, str(script), str(TESTS), str(tmp_path)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=100)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=600)
     assert "if __name__ == '__main__'" in done.stderr.splitlines()[-1]
 
 
@@ -284,7 +284,7 @@ def test_workers_end_when_their_parent_does(number: signal.Signals, tmp_path: Pa
         try:
             assert wait_until(lambda: len(list(begun.iterdir())) == 2)
             process.send_signal(number)
-            process.wait(20)
+            process.wait(600)
         finally:
             process.kill()
     workers = [int(path.name) for path in begun.iterdir()]
@@ -304,7 +304,7 @@ def test_no_worker_is_ended_by_ctrl_c_which_its_parent_handles(tmp_path: Path) -
             for worker in workers:
                 os.kill(int(worker), signal.SIGINT)
             (begun / "go").touch()
-            assert process.communicate(timeout=60)[1] == ""
+            assert process.communicate(timeout=600)[1] == ""
         finally:
             process.kill()
     assert {path.stem for path in begun.glob("*.ended")} == workers

@@ -6,7 +6,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import damage
 import numpy as np
@@ -21,14 +20,10 @@ from typer.testing import CliRunner
 from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import classifying, refining
+from gnss_sem_map.mapping import classifying
 from gnss_sem_map.mapping.classifying import FILE, DriveClassifier
-from gnss_sem_map.mapping.raw_map import open_raw
-from gnss_sem_map.process.execution import InProcess
-from gnss_sem_map.process.run_stats import silent
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
 from gnss_sem_map.voxels import blocks
-from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 pytestmark = pytest.mark.integration
@@ -317,26 +312,6 @@ def test_an_added_drive_leaves_the_classifier_of_the_first_alone(
     after = (out / "drives/a" / CLASSIFIER).stat()
     assert (after.st_ino, after.st_mtime_ns) == (first.st_ino, first.st_mtime_ns)
     assert refined(out) == refined(both)
-
-
-def test_a_drive_touches_only_the_blocks_around_it(
-    street_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A block is made again where the classifiers around it are others: those of drives beyond its halo are not."""
-    passed = {"near": [(0, 0), (1, 0)], "beside": [(2, 0)], "far": [(40, 0), (41, 0)]}
-    made = refining._Refinement(
-        open_raw(street_run.folder, URBAN), tmp_path, Settings(), silent, None, InProcess(), tmp_path
-    )
-    made.__dict__["_voxels"] = dict.fromkeys([(0, 0), (3, 0), (40, 0)], 1)
-    monkeypatch.setattr(refining, "files_of", lambda of: dict.fromkeys(map(name_of, passed[of.parent.name])))
-    found = {}
-    for names in (("near", "beside"), ("near", "beside", "far")):
-        drives = [SimpleNamespace(folder=tmp_path / name, digest=name) for name in names]
-        monkeypatch.setattr(refining, "drives_of", lambda *_, drives=drives: drives)
-        found[names] = made._classifier_digests()
-    before, after = found.values()
-    assert before == {((0, 0),): ["near"], ((3, 0),): ["beside"], ((40, 0),): []}
-    assert after == before | {((40, 0),): ["far"]}
 
 
 @pytest.mark.slow

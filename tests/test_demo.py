@@ -88,6 +88,7 @@ def demo_without_torch(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path) -> None:
     done = demo_without_torch("-o", tmp_path / "demo", "--labels", "network")
     assert done.returncode == 1

@@ -159,7 +159,10 @@ def conserve(clean: dict[str, Clean], layout: str, seed: int, trial: Callable[..
         pytest.param(range(5, 48), marks=pytest.mark.faults),
     ],
 )
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    "layout",
+    ["raw", *(pytest.param(name, marks=pytest.mark.slow) for name in ("odometry", "table")), "moving"],
+)
 def test_nothing_is_lost_on_random_damage(
     layout: str, seeds: range, clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
 ) -> None:

@@ -16,7 +16,9 @@ QUICK, WHOLE = 20, 2000
     [(0, QUICK), pytest.param(QUICK, WHOLE, marks=pytest.mark.faults)],
     ids=["some", "many"],
 )
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (n % 8 > 0)) for n, name in enumerate(READERS)]
+)
 def test_damaged_files_are_read_or_refused(name: str, first: int, count: int, trial, tmp_path: Path) -> None:
     report = fuzz(READERS[name], name, first, count, tmp_path)
     figures = f"{report.inputs} | {report.refused} | {report.slowest_s:.2f} s | {report.peak_mb:.0f} MB"

@@ -91,6 +91,7 @@ def test_processes_map_the_bytes_of_this_process(
     assert files_of(shared(drive, source, tmp_path / "work", Processes(workers))) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_dask_maps_the_bytes_of_this_process(
     drive: Drive, source: Source, expected: dict[str, bytes], tmp_path: Path

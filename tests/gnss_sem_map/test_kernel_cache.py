@@ -77,6 +77,7 @@ def test_what_was_compiled_ahead_is_used(start: Start) -> None:
     assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trap", ["open to all", "a link"])
 def test_a_folder_that_others_may_have_filled_is_not_taken(start: Start, tmp_path: Path, trap: str) -> None:
     planted = tmp_path / "temporary" / f"{PREFIX}0"

@@ -62,6 +62,7 @@ def test_what_is_saved_comes_back(
     assert not (tmp_path / "w").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_processes_find_the_same(
     small_log: SensorLog, small_track: Trajectory, expected: ScanMatches, small_source: Source, tmp_path: Path

@@ -62,7 +62,7 @@ def assert_same(found: Sequence[Found | None], expected: Sequence[Found | None])
                 np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("executor", [InProcess(), pytest.param(Processes(2), marks=pytest.mark.integration)])
+@pytest.mark.parametrize("executor", [InProcess(), pytest.param(Processes(2), marks=pytest.mark.slow)])
 def test_other_processes_find_the_same(
     small_log: SensorLog, small_track: Trajectory, small_source: Source, places: Pass, expected: list[Found | None],
     tmp_path: Path, executor: Executor,

@@ -126,6 +126,7 @@ except signals.Stopped as stopped:
 """
 
 
+@pytest.mark.slow
 def test_a_signal_while_a_function_is_compiled_or_loaded_crashes_nothing(tmp_path: Path) -> None:
     """LLVM goes on without a function whose loading raised an exception, and a call of it would crash."""
     for _ in ("compiled", "loaded from the cache"):
@@ -187,6 +188,7 @@ for line in range(1, lines + 1):
 """
 
 
+@pytest.mark.slow
 def test_a_signal_at_any_line_of_claiming_a_folder_leaves_no_lock_and_no_work_folder(tmp_path: Path) -> None:
     program = [sys.executable, "-c", CLAIM, str(tmp_path)]
     ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=600)

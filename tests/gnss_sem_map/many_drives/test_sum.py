@@ -87,11 +87,18 @@ def test_a_map_to_which_a_drive_was_added_is_that_of_all_at_once(
 
 
 def test_a_map_from_which_a_drive_was_taken_is_that_of_the_others(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+    made: dict[str, Path], tmp_path: Path
 ) -> None:
     out = shutil.copytree(made["abc"], tmp_path / "out")
     remove_drive(out, "c", workers=2)
     assert_same(out, made["ab"])
+
+
+@pytest.mark.slow
+def test_a_map_from_which_its_first_drive_was_taken_stays_in_its_frame(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    out = shutil.copytree(made["ab"], tmp_path / "out")
     remove_drive(out, "a")
     frame = read_frame(made["ab"] / "map")
     run_drives([drives.by_name["b"]], tmp_path / "b", SETTINGS, how, origin=frame)

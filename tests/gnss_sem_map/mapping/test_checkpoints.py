@@ -132,6 +132,7 @@ def assert_resumed(drive: Drive, at_once: tuple[Maps, RunStats], work: Path) -> 
     assert [path.name for path in work.glob(".*.*.*")] == [], "what the killed processes left stays"
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_a_killed_run_goes_on_to_the_same_map(
     drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path

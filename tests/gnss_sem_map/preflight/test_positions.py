@@ -264,8 +264,9 @@ def test_poses_of_a_camera_look_aside() -> None:
     assert any("other axes" in line for line in wrong(findings(given(T))))
 
 
-@pytest.mark.parametrize("shift_s", [18.0, pytest.param(-18.0, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("seed", [0, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shift_s", [18.0, -18.0])
+@pytest.mark.parametrize("seed", [0, 6])
 def test_gps_time_in_place_of_utc_is_found(seed: int, shift_s: float) -> None:
     log = drive(seed, 120.0, ImuNoise())
     fixes = GnssFixes(fixes_of(log).stamps + shift_s, fixes_of(log).positions, fixes_of(log).stddevs)

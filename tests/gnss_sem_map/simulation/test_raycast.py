@@ -158,6 +158,7 @@ def test_the_ground_is_met_once_and_at_its_height(
     assert clear.min() > -1e-6
 
 
+@pytest.mark.slow
 def test_the_grid_forgets_nothing(whole_drive: Simulation) -> None:
     world = whole_drive.world
     scene = world.scene(12.0, 12.1)

@@ -89,6 +89,7 @@ def test_positions_are_as_wrong_as_they_claim(gnss: Gnss, claimed: float, stddev
     assert np.std(errors, axis=(0, 1)) == pytest.approx(stddevs, rel=0.1)
 
 
+@pytest.mark.slow
 def test_what_the_truth_says_is_there_on_its_day_and_not_on_the_other_one(days: list[Simulation]) -> None:
     scenes = [still(day) for day in days]
     near = [

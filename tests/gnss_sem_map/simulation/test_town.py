@@ -146,6 +146,7 @@ def test_nobody_runs_into_anybody(drive: Simulation) -> None:
             assert np.linalg.norm(mine - other, axis=1).min() > 0.9 * (radius + reach)
 
 
+@pytest.mark.slow
 def test_movers_follow_the_same_streets_when_the_drive_is_longer() -> None:
     short, long = prepare(3.0, 0), prepare(60.0, 0)
     stamps = np.arange(0.0, 3.0, 0.1)

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import small_tasks
-from dask_clusters import started, two_workers
+from dask_clusters import IN_TIME_S, started, two_workers
 from processes import wait_until
 
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
@@ -48,6 +48,12 @@ def local_cluster(workers: int, **more: Any) -> Any:
     return distributed.LocalCluster(
         n_workers=workers, threads_per_worker=1, dashboard_address=":0", silence_logs=50, **more
     )
+
+
+@pytest.fixture(autouse=True)
+def any_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy one a worker is not there in a minute."""
+    monkeypatch.setattr(dask_cluster, "FIRST_WORKER_S", IN_TIME_S)
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ $(KERNELS): $(TOOLS) gnss_sem_map/cli/kernels.txt
 
 kernels: $(KERNELS)
 
-# Laws, oracles and one whole run of each kind: five minutes on two cores.
+# Laws, oracles and one whole run of each kind.
 test: $(KERNELS)
 	$(PYTEST) -m 'not slow and not demo and not faults'
 

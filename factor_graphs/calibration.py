@@ -14,14 +14,12 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import C
-from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array
 from factor_graphs.chi_square import BEYOND_DOUBT, probability_below, quantile
-from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
-from factor_graphs.model import motion_from
+from factor_graphs.elimination import by_sections, eliminate, factor_of, shared_keys, split
+from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.problem import Fit, Problem
-
-Array = NDArray[np.float64]
 
 # What may be wrong before anything is estimated: clock s, antenna m, scale of the gyroscope.
 CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03
@@ -29,7 +27,7 @@ DOUBT = 1 - probability_below(BEYOND_DOUBT**2, 1)
 # A scale is in question where fixes and IMU alone show more than those of half of all good gyroscopes.
 QUESTIONABLE = 0.5
 # The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
-STRETCHES, SHORTEST_S, PLACED_S = 8, 20.0, 1.0
+STRETCHES, SHORTEST_S, PLACED_S = 8, HEADING_HOLDS_S, 1.0
 # Columns of an IMU factor: pose, velocity, pose, velocity, biases, biases.
 OF_IMU = np.cumsum([0, 6, 3, 6, 3, 6, 6])
 
@@ -216,7 +214,7 @@ def scale_error(problem: Problem, fit: Fit) -> float:
 def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianFactor]:
     """The linear graph, with columns of lasting errors beside those of the IMU and of the fixes."""
     k, size, intervals = len(problem.intervals.keyframes), len(begins) + 5, problem.intervals
-    T, velocities = motion_from(fit.values)
+    T, velocities, _ = fit.states
     turned = np.add.reduceat(intervals.angular_rate * intervals.durations[:, None], intervals.bounds[:-1])
     axis = upright_axis(intervals.specific_force)
     rates = turned[:, axis] / np.diff(intervals.keyframes)
@@ -229,16 +227,10 @@ def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianF
             columns = np.zeros((len(b), size))
             columns[:, -1] = (A[:, axis - 9] + A[:, axis - 3]) * rates[n]
             terms = [(key, A[:, i:j]) for key, (i, j) in zip(row.keys(), pairwise(OF_IMU), strict=True)]
-            row = _joined(terms, columns, b)
+            row = factor_of([*terms, (C(0), columns)], b)
         elif first_fix <= n < first_fix + len(problem.at):
             A, b = row.jacobian()
             columns = np.zeros((3, size))
             columns[:, stretch[n - first_fix]], columns[:, -4:-1] = A[:, 3:] @ moving[n - first_fix], A[:, 3:]
-            row = _joined([(row.keys()[0], A)], columns, b)
+            row = factor_of([(row.keys()[0], A), (C(0), columns)], b)
         yield row
-
-
-def _joined(terms: list[tuple[int, Array]], columns: Array, b: Array) -> gtsam.JacobianFactor:
-    """A factor of many keys: of GTSAM's constructors, only that of a conditional takes a list from Python."""
-    unit = gtsam.noiseModel.Unit.Create(len(b))
-    return gtsam.JacobianFactor(gtsam.GaussianConditional([*terms, (C(0), columns)], 1, b, unit))

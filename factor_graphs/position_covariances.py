@@ -5,9 +5,8 @@ its standard deviations, and leaves a covariance that is positive definite.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from factor_graphs.arrays import Array, Mask
 
 # Rows and columns of the correlations east-north, east-up, north-up.
 _PAIRS = np.array([0, 0, 1]), np.array([1, 2, 2])
@@ -24,7 +23,7 @@ def matrices_of(correlations: Array) -> Array:
     return matrices
 
 
-def are_correlations(correlations: Array) -> NDArray[np.bool_]:
+def are_correlations(correlations: Array) -> Mask:
     """Which rows (m,) are of a positive definite matrix; correlations (m, 3) finite."""
     return np.asarray(np.linalg.eigvalsh(matrices_of(correlations))[:, 0] >= LEAST_EIGENVALUE)
 
@@ -35,7 +34,7 @@ def covariances_of(stddevs: Array, correlations: Array | None) -> Array:
     return np.asarray(matrices * stddevs[:, :, None] * stddevs[:, None])
 
 
-def split_covariances(covariances: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+def split_covariances(covariances: Array) -> tuple[Array, Array, Mask]:
     """Standard deviations (m, 3) m, correlations (m, 3), and which rows (m,) are no covariance: covariances (m, 3, 3).
 
     A matrix that is not symmetric and positive definite is no covariance. Its correlations become zero: what is left of

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.arrays import Array
 from factor_graphs.elimination import (
     OF_KEYFRAME,
     SIZE,
@@ -23,8 +24,6 @@ from factor_graphs.elimination import (
 )
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.model import from_values
-
-Array = NDArray[np.float64]
 
 # The backward solution begins knowing no more than this: rad, m, m/s.
 LOOSE = (1.0, 1e3, 1e2)
@@ -49,7 +48,7 @@ def separation_of(
 ) -> Separation:
     """The separation at k keyframes of a graph at its solution; `noise` tells what is known of biases before."""
     k = len(stamps)
-    T, _, biases = from_values(values, k)
+    T, _, biases = from_values(values)
     linear = graph.linearize(values)
     factors = [linear.at(n) for n in range(linear.size())]
     spans = np.array([_span(factor, k) for factor in factors])

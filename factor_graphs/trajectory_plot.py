@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import GnssFixes
@@ -13,7 +12,6 @@ from factor_graphs.smoothing import Solution, heading_stddevs
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 
 AXES = ("east", "north", "up")
 COLOURS = ("tab:red", "tab:green", "tab:blue")

@@ -24,7 +24,7 @@ define install
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c $(CONSTRAINTS) -e '$(1)'; }
 endef
 
-.PHONY: kernels test test-newest test-unit test-slow test-demo test-faults check demo notebooks docs package clean
+.PHONY: kernels test test-all test-newest test-unit test-slow test-demo test-faults check demo notebooks docs package clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -44,8 +44,13 @@ $(KERNELS): $(TOOLS) gnss_sem_map/cli/kernels.txt
 
 kernels: $(KERNELS)
 
+# Laws, oracles and one whole run of each kind.
 test: $(KERNELS)
 	$(PYTEST) -m 'not slow and not demo and not faults'
+
+# These and the thorough checks.
+test-all: $(KERNELS)
+	$(PYTEST) -m 'not demo and not faults'
 
 # The tests with the newest of every dependency, which is what a user of pip gets; torch alone is held, or pip takes its
 # build for GPUs.
@@ -77,9 +82,9 @@ package: $(TOOLS)
 	$$place/venv/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl; \
 	mkdir $$place/empty; cd $$place/empty; ../venv/bin/gnss-sem-map demo --seconds 3
 
-# With PART='--splits 3 --group 1', a third of them.
-test-slow: $(TOOLS)
-	$(PYTEST) -m slow $(PART)
+# The thorough checks alone. With PART='--splits 8 --group 1', an eighth of them.
+test-slow: $(KERNELS)
+	$(PYTEST) -m 'slow and not faults' $(PART)
 
 test-demo: $(TOOLS)
 	$(PYTEST) -m demo

@@ -14,6 +14,7 @@ import matplotlib.font_manager  # noqa: F401 (the first import on a machine star
 import pytest
 import street
 from declared import DATA, absent
+from made_once import made_once
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import Run, Settings
@@ -112,7 +113,7 @@ def _refused(what: str) -> Callable[..., NoReturn]:
 @pytest.fixture(scope="session")
 def small_drive(tmp_path_factory: pytest.TempPathFactory) -> street.Street:
     """A dozen scans of the analytic street, written as a KITTI raw drive; read only."""
-    return street.write(tmp_path_factory.mktemp("street"))
+    return made_once(tmp_path_factory, "street", street.write)
 
 
 @pytest.fixture(scope="session")
@@ -137,9 +138,18 @@ def small_track(small_log: SensorLog) -> Trajectory:
 @pytest.fixture(scope="session")
 def finished(small_drive: street.Street, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run of the small drive with labels; read only. Its classifier is soon trained."""
-    out, labels = tmp_path_factory.mktemp("finished") / "out", f"labels:{small_drive.labels}"
-    settings = Settings().changed("geometric_classifier.rows_per_fold=1000")
-    return finished_run.run(small_drive.drive, out, labels, settings, write_labels=True, force=True)
+    settings, labels = (
+        Settings().changed("geometric_classifier.rows_per_fold=1000"),
+        f"labels:{small_drive.labels}",
+    )
+
+    def make(folder: Path) -> Path:
+        out = folder / "out"
+        return finished_run.run(
+            small_drive.drive, out, labels, settings, write_labels=True, force=True
+        ).folder
+
+    return Run.open(made_once(tmp_path_factory, "finished", make))
 
 
 @pytest.fixture(scope="session")

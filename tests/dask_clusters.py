@@ -14,16 +14,23 @@ from pathlib import Path
 from processes import wait_until
 
 TESTS = Path(__file__).parent
+IN_TIME_S = 600.0
+"""In which a worker is there on any machine."""
 
 
 @contextmanager
 def two_workers(folder: Path) -> Iterator[str]:
-    """The address of a scheduler with two workers of one thread; their logs are in the folder."""
+    """The address of a scheduler with two workers of one thread, which are there; their logs are in the folder."""
+    from distributed import Client
+
     file = folder / "scheduler.json"
     with started("scheduler", file, "--port", "0", "--dashboard-address", ":0"):
         assert wait_until(file.exists)
         with started("worker", file, "--nthreads", "1", "--nworkers", "2", "--no-dashboard"):
-            yield json.loads(file.read_text())["address"]
+            address = json.loads(file.read_text())["address"]
+            with Client(address, timeout=IN_TIME_S) as client:
+                client.wait_for_workers(2, IN_TIME_S)
+            yield address
 
 
 @contextmanager

@@ -11,8 +11,8 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.runs.many_drives import HowMapped, ManyDrives, run_drives
 from gnss_sem_map.segmentation import DEMO_CALIBRATION
 
-# with a file that they name: each result has a copy of its own; the classifiers are soon trained
-CHOSEN = (f"calibration={DEMO_CALIBRATION}", "geometric_classifier.rows_per_fold=1000")
+# with a file that they name: each result has a copy of its own; `test_classifying.py` has the classifiers of drives
+CHOSEN = (f"calibration={DEMO_CALIBRATION}", "geometric_classifier.enabled=false")
 SETTINGS = Settings().changed(*CHOSEN)
 OF_MOMENT = ("run.json", "report.html")
 """Files of a drive that hold times and memory."""

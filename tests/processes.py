@@ -27,8 +27,8 @@ def _state_and_group(pid: int) -> tuple[str, int]:
     return fields[0], int(fields[2])
 
 
-def wait_until(condition: Callable[[], object], within_s: float = 30.0) -> bool:
-    """Wait until something is true; whether it became true in time."""
+def wait_until(condition: Callable[[], object], within_s: float = 600.0) -> bool:
+    """Wait until something is true; whether it became true in a time in which it does on any machine."""
     end = time.monotonic() + within_s
     while time.monotonic() < end:
         if condition():

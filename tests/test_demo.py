@@ -25,6 +25,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
     return out, drive / "truth", done.stdout
 
 
+@pytest.mark.slow
 def test_the_demo_leaves_every_figure(demo: tuple[Path, Path, str]) -> None:
     out, _, _ = demo
     metrics = json.loads((out / "metrics.json").read_text())
@@ -45,6 +46,7 @@ def test_the_demo_leaves_every_figure(demo: tuple[Path, Path, str]) -> None:
     assert 0 <= metrics["calibration"]["ece"] < 0.2
 
 
+@pytest.mark.slow
 def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, Path, str]) -> None:
     out, _, printed = demo
     for says in (
@@ -86,6 +88,7 @@ def demo_without_torch(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path) -> None:
     done = demo_without_torch("-o", tmp_path / "demo", "--labels", "network")
     assert done.returncode == 1
@@ -106,6 +109,7 @@ def test_the_corrupted_truth_can_stand_in_for_the_network(
     assert ours["semantics"] != theirs["semantics"]
 
 
+@pytest.mark.slow
 def test_scores_agree_with_the_independent_scorer(
     demo: tuple[Path, Path, str], real_data: Path, tmp_path: Path
 ) -> None:
@@ -155,6 +159,7 @@ def test_a_folder_that_no_demo_wrote_is_left_alone(tmp_path: Path) -> None:
     assert precious.read_text() == "years of work"
 
 
+@pytest.mark.slow
 def test_a_truth_that_does_not_fit_is_refused(demo: tuple[Path, Path, str], tmp_path: Path) -> None:
     out, truth, _ = demo
     shutil.copytree(truth / "labels", tmp_path / "labels")

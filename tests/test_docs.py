@@ -90,6 +90,13 @@ def test_what_text_calls_a_command_is_one(code: str) -> None:
         assert path.is_dir() or all(f'"{option}"' in path.read_text("utf-8") for option in options)
 
 
+def test_every_night_makes_targets_that_there_are() -> None:
+    night = yaml.safe_load((ROOT / ".github/workflows/nightly.yml").read_text("utf-8"))
+    made = night["jobs"]["tests"]["strategy"]["matrix"]["target"]
+    assert set(made) <= set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "block", [block for block in BLOCKS if block.language == "python"], ids=lambda b: b.page
 )

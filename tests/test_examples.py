@@ -34,6 +34,7 @@ def test_fix_by_fix_it_is_better_than_the_fixes_and_says_how_good(printed) -> No
     assert 0.3 < np.sqrt(np.mean(error**2) / np.mean(stddev**2)) < 2
 
 
+@pytest.mark.slow
 def test_smoothing_beats_filtering_and_the_graph_beats_both(printed) -> None:
     table = [re.split(r"\s{2,}", line) for line in printed("kalman_baseline.py", "--drives", "1")[1:]]
     figures = {name: [float(value.removesuffix(" %")) for value in row] for name, *row in table}

@@ -8,6 +8,8 @@ from street import Street
 
 from gnss_sem_map import config, run
 from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.classifying import FILE
+from gnss_sem_map.voxels.semantic_map import State
 
 PAPER = Path(__file__).parents[1] / "examples" / "paper.yaml"
 
@@ -22,6 +24,8 @@ def test_the_paper_s_settings_do_what_the_paper_does_and_no_more(small_drive: St
     assert not beside.moving()  # the paper looks for what moved in the map, not beside it
     assert not beside.moved.tiles
     assert not settings.refinement.potts_mrf.enabled
+    assert not (done.map().states == State.INFERRED).any()
+    assert not (done.folder / "evidence" / FILE).exists()
     labels = done.map().labels
     known = labels[labels >= 0]
     assert len(known) > 1000

@@ -25,11 +25,13 @@ from gnss_sem_map.voxels.semantic_map import State
 
 URBAN = open_label_set()
 RAW_IDS = np.array([40, 48, 10, 50, 70, 0])
+SOON = ("--set", "geometric_classifier.rows_per_fold=1000")
+"""The classifier of each run is soon trained."""
 
 
 def run(drive: Path, labels: Path, out: Path, *more: str) -> dict:
     done = gnss_sem_map(
-        "run", drive, "--segmenter", f"labels:{labels}", "-o", out, "--write-labels", "--json", *more
+        "run", drive, "--segmenter", f"labels:{labels}", "-o", out, "--write-labels", "--json", *SOON, *more
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -41,7 +43,7 @@ def raw_run(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Pa
     out = tmp_path_factory.mktemp("runs") / "out"
     labels = f"labels:{small_drive.labels}"
     done = in_a_process(
-        "run", small_drive.drive, "--segmenter", labels, "-o", out, "--write-labels", "--json"
+        "run", small_drive.drive, "--segmenter", labels, "-o", out, "--write-labels", "--json", *SOON
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == json.loads((out / "run.json").read_text())
@@ -131,12 +133,14 @@ def test_an_odometry_sequence_becomes_a_map(small_drive: Street, tmp_path: Path)
     assert laspy.read(tmp_path / "out/map.laz").header.parse_crs() is None
 
 
+@pytest.mark.slow
 def test_a_table_log_becomes_a_map(small_drive: Street, tmp_path: Path) -> None:
     drive = street.write_table_log(tmp_path, small_drive)
     run(drive, small_drive.labels, tmp_path / "out")
     assert agreement(tmp_path / "out", small_drive, 1) > 0.97
 
 
+@pytest.mark.slow
 def test_a_table_log_without_a_camera_is_mapped_without_asking_for_a_network(
     small_drive: Street, tmp_path: Path
 ) -> None:
@@ -148,6 +152,7 @@ def test_a_table_log_without_a_camera_is_mapped_without_asking_for_a_network(
     assert "no camera is described, so its" in done.stderr
 
 
+@pytest.mark.slow
 def test_two_runs_give_the_same_map_and_a_subset_of_frames_a_smaller_one(
     raw_run: Path, small_drive: Street, tmp_path: Path
 ) -> None:
@@ -161,6 +166,7 @@ def test_two_runs_give_the_same_map_and_a_subset_of_frames_a_smaller_one(
     ]
 
 
+@pytest.mark.slow
 def test_a_drive_is_added_to_a_map_and_the_first_is_taken_out(tmp_path: Path) -> None:
     drives = street_drives.write(tmp_path, ("monday", "tuesday"))
     first, second = drives.by_name.values()
@@ -186,6 +192,7 @@ def test_a_drive_is_added_to_a_map_and_the_first_is_taken_out(tmp_path: Path) ->
     assert [path.name for path in (out / "drives").iterdir()] == ["tuesday"]
 
 
+@pytest.mark.slow
 def test_a_drive_without_images_gives_a_map_without_labels_and_a_warning(
     small_drive: Street, tmp_path: Path
 ) -> None:
@@ -334,7 +341,7 @@ def test_a_drive_with_images_and_no_segmenter_is_told_its_choices(
 
 
 def test_the_settings_that_are_printed_are_those_of_the_run(raw_run: Path) -> None:
-    assert gnss_sem_map("config").stdout == (raw_run / "config.yaml").read_text()
+    assert gnss_sem_map("config", *SOON).stdout == (raw_run / "config.yaml").read_text()
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -215,9 +215,9 @@ def _scheduler_there(client: Client, address: str) -> Iterator[None]:
     """Raise DataError when the scheduler is lost while it is asked."""
     try:
         yield
-    except (OSError, AttributeError, CancelledError) as error:  # CommClosedError is an OSError
-        # a client that was closed has no scheduler
-        if isinstance(error, AttributeError) and client.scheduler is not None:
+    except (OSError, AttributeError, RuntimeError, CancelledError) as error:  # CommClosedError is an OSError
+        # a client that is closed has no scheduler; one that connects again raises what its time-outs raise
+        if isinstance(error, AttributeError | RuntimeError) and client.status == "running":
             raise
         raise DataError(f"scheduler {address}: was lost; see that it runs, and --resume") from None
 

@@ -25,7 +25,7 @@ def precise(drive, offset: float) -> GnssFixes:
     )
 
 
-@pytest.mark.parametrize("offset", [0.1, -0.04])
+@pytest.mark.parametrize("offset", [pytest.param(0.1, marks=pytest.mark.slow), -0.04])
 def test_a_time_offset_is_found_unasked_where_the_data_leave_no_doubt(simulate, offset):
     drive = simulate(60, seconds=180.0, noise=ImuNoise())
     s = smooth(drive.imu, precise(drive, offset), FRAME, None, LEVER)
@@ -43,6 +43,7 @@ def test_where_there_is_no_offset_none_is_applied(simulate):
         assert s.calibration.time_offset_s == 0.0
 
 
+@pytest.mark.slow
 def test_a_time_offset_is_left_alone_when_it_shall_be(simulate):
     drive = simulate(60, seconds=180.0, noise=ImuNoise())
     s = smooth(drive.imu, precise(drive, 0.1), FRAME, SmootherSettings(estimate_time_offset=False), LEVER)
@@ -80,7 +81,7 @@ def test_covariances_hold_what_is_not_known_of_clock_and_lever_arm(simulate):
     np.testing.assert_allclose(found.keyframes.position_covariances, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("scale", [1.01, 0.97])
+@pytest.mark.parametrize("scale", [1.01, pytest.param(0.97, marks=pytest.mark.slow)])
 def test_a_gyroscope_that_turns_too_much_is_found(simulate, scale):
     drive = simulate(66, seconds=300.0, noise=ImuNoise(), moves=on_its_side)
     wrong = ImuSamples(drive.imu.stamps, drive.imu.specific_force, scale * drive.imu.angular_rate)
@@ -100,7 +101,7 @@ def on_its_side(seconds, rng):
     return Mounted(random_drive(seconds, rng), T)
 
 
-@pytest.mark.parametrize("stddev", [0.02, 1.0])
+@pytest.mark.parametrize("stddev", [pytest.param(0.02, marks=pytest.mark.slow), 1.0])
 def test_a_step_of_the_receivers_clock_is_found_where_it_is(simulate, stddev):
     drive = simulate(67, seconds=300.0, noise=ImuNoise())
     fixes = simulate_gnss(drive.motion, drive.fixes.stamps, stddev, LEVER, np.random.default_rng(0))

@@ -41,6 +41,7 @@ def repeated(fixes: GnssFixes) -> GnssFixes:
     return GnssFixes(stamps, np.repeat(fixes.positions, 10, axis=0), np.repeat(fixes.stddevs, 10, axis=0))
 
 
+@pytest.mark.slow
 def test_fixes_that_a_logger_repeats_are_used_once_at_the_moment_of_the_first(simulate):
     drive = simulate(0, seconds=150.0, noise=ImuNoise(), moves=turned)
     fixes = late(drive)
@@ -82,6 +83,7 @@ def test_an_offset_that_the_motion_excludes_is_not_taken_but_counted(simulate):
     assert checked(right, drive.imu, fixes, of_noise=1.0) is right
 
 
+@pytest.mark.slow
 def test_an_offset_is_not_taken_where_a_wrong_gyroscope_leaves_nothing_to_tell_it_by(simulate):
     drive = simulate(0, seconds=80.0, noise=ImuNoise())
     mirrored = ImuSamples(

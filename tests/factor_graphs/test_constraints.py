@@ -81,6 +81,7 @@ def stops_for_a_minute(seconds: float, rng: np.random.Generator) -> Motion:
     return follow(way, [0, 10, 60, 70, 130, 140, 200, 210, 240], [0, 10, 10, 0, 0, 10, 10, 0, 0])
 
 
+@pytest.mark.slow
 def test_a_stop_shows_the_bias_of_the_gyroscope_about_the_vertical(simulate):
     noise = ImuNoise(gyroscope_bias_walk=10 * ImuNoise().gyroscope_bias_walk)
     off: dict[float, list[float]] = {1e-4: [], 100.0: []}

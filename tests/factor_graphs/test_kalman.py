@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from factor_graphs.accuracy import anees_band, errors
 from factor_graphs.geodesy import LocalFrame
@@ -32,6 +33,7 @@ def test_smoothing_beats_filtering_and_the_graph_beats_both(simulate):
     assert means["graph"] <= 1.02 * means["rts"]
 
 
+@pytest.mark.slow
 def test_its_innovations_are_as_large_as_it_expects(simulate):
     nis = np.concatenate([_settled_nis(simulate(80 + seed, noise=ImuNoise())) for seed in range(3)])
     low, high = anees_band(3, len(nis), confidence=0.9999)

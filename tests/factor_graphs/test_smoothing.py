@@ -257,7 +257,9 @@ def test_an_optimiser_stopped_at_its_limit_is_an_error(mems):
         smooth(mems.imu, mems.fixes, FRAME, SmootherSettings(max_iterations=1), LEVER)
 
 
-@pytest.mark.parametrize("seconds", [2.0, 6.0, 15.0])
+@pytest.mark.parametrize(
+    "seconds", [2.0, pytest.param(6.0, marks=pytest.mark.slow), pytest.param(15.0, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize(("step", "stddev"), [(0.2, 0.02), (0.1, 1.0), (0.5, 0.3)])
 @pytest.mark.parametrize("imu_step", [0.01, 0.1])
 def test_short_drives_of_any_rate_are_solved(simulate, seconds, step, stddev, imu_step):
@@ -272,7 +274,7 @@ def test_short_drives_of_any_rate_are_solved(simulate, seconds, step, stddev, im
     )
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wrong", [lambda force: force / 9.81, lambda force: force - [0.0, 0.0, 9.81]])
 def test_a_specific_force_in_g_or_without_gravity_is_told(simulate, wrong, seed):
     drive = simulate(seed, noise=ImuNoise(), seconds=60.0)

@@ -163,7 +163,7 @@ def test_the_mounting_is_found_as_well_as_it_says(simulate):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("moves", [hand_held, drone])
+@pytest.mark.parametrize("moves", [hand_held, pytest.param(drone, marks=pytest.mark.slow)])
 def test_what_is_no_vehicle_is_left_alone_and_told_why(simulate, moves):
     drive = simulate(70, seconds=150.0, noise=ImuNoise(), moves=moves)
     found, without = (
@@ -185,6 +185,7 @@ def test_a_vehicle_that_reverses_keeps_its_heading(simulate):
     assert np.degrees(np.abs(e.rotation[:, 2])).max() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_a_skid_does_not_turn_the_heading(simulate):
     off, found = [], []
@@ -254,6 +255,7 @@ def test_an_imu_on_a_roof_is_as_good_as_one_on_the_axle(simulate):
     assert vehicle.slip[0].typical < 0.03
 
 
+@pytest.mark.slow
 def test_on_a_roundabout_the_verdict_says_how_little_it_tells_of_the_mounting(simulate):
     """At one speed and one turn rate, yaw and distance to the axle cannot be told apart."""
 

@@ -138,8 +138,9 @@ def test_covariances_are_those_of_gtsams_marginals(simulate, settings):
         assert np.abs((ours - theirs) / np.outer(stddevs, stddevs)).max() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.integration
-@pytest.mark.parametrize("settings", [SmootherSettings(), NO_VEHICLE])
+@pytest.mark.parametrize("settings", [SmootherSettings(), pytest.param(NO_VEHICLE, marks=pytest.mark.slow)])
 def test_the_calibration_is_found_as_well_as_it_says(simulate, settings):
     for seed in (60, 61, 62):
         drive = simulate(seed, seconds=300.0, noise=ImuNoise(), moves=mounted)
@@ -154,7 +155,13 @@ def test_the_calibration_is_found_as_well_as_it_says(simulate, settings):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("slips", [(), ((70.0, 74.0, 0.3), (140.0, 146.0, 0.15), (165.0, 168.0, -1.0))])
+@pytest.mark.parametrize(
+    "slips",
+    [
+        pytest.param((), marks=pytest.mark.slow),
+        ((70.0, 74.0, 0.3), (140.0, 146.0, 0.15), (165.0, 168.0, -1.0)),
+    ],
+)
 def test_outages_are_better_with_wheels_even_where_they_slip(simulate, slips):
     off, squares = {"without": [], "with": []}, []
     for seed in range(3):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import street
 from faults.drive_files import small_street
+from made_once import made_once
 
 TRIALS: Counter[str] = Counter()
 
@@ -27,13 +28,16 @@ def trial(request: pytest.FixtureRequest) -> Callable[..., None]:
 @pytest.fixture(scope="session")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The same small street in three layouts."""
-    folder = tmp_path_factory.mktemp("drives")
-    made = small_street(folder / "kitti")
-    return {
-        "kitti": made.drive,
-        "odometry": street.write_odometry(folder / "odometry", made),
-        "table": street.write_table_log(folder / "table", made),
-    }
+
+    def make(folder: Path) -> dict[str, Path]:
+        made = small_street(folder / "kitti")
+        return {
+            "kitti": made.drive,
+            "odometry": street.write_odometry(folder / "odometry", made),
+            "table": street.write_table_log(folder / "table", made),
+        }
+
+    return made_once(tmp_path_factory, "layouts", make)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

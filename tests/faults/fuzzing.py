@@ -51,7 +51,7 @@ def fuzz(make: Callable[[Path], Reader], name: str, first: int, count: int, fold
     context.set_forkserver_preload([*PRELOAD, "faults.readers"])
     process = context.Process(target=_child, args=(make, name, first, count, folder))
     process.start()
-    process.join(120 + count)
+    process.join(600 + count)
     if process.exitcode is None:
         process.kill()
         process.join()
@@ -80,7 +80,7 @@ def _child(make: Callable[[Path], Reader], name: str, first: int, count: int, fo
         content = reader.mutate(seed, np.random.default_rng([zlib.crc32(name.encode()), number]))
         reader.file.write_bytes(content)
         before, start = _reset_peak(), time.process_time()
-        signal.alarm(20)
+        signal.alarm(120)
         try:
             reader.read()
         except (SemMapError, FactorGraphError) as error:
@@ -109,7 +109,7 @@ def _child(make: Callable[[Path], Reader], name: str, first: int, count: int, fo
 
 
 def _too_long(*_: object) -> None:
-    raise TimeoutError("20 s")
+    raise TimeoutError("120 s")
 
 
 def _limit_addresses() -> None:

@@ -25,7 +25,7 @@ def killed_before_change(number: int, folder: Path, function: Callable[..., None
     context.set_forkserver_preload(PRELOAD)
     process = context.Process(target=_child, args=(number, str(folder), function, arguments))
     process.start()
-    process.join(120)
+    process.join(600)
     assert process.exitcode in (0, KILLED), f"ended with {process.exitcode} at change {number}"
     return process.exitcode == KILLED
 

@@ -150,20 +150,22 @@ def conserve(clean: dict[str, Clean], layout: str, seed: int, trial: Callable[..
     shutil.rmtree(place.root)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    "seeds",
+    [
+        range(1, 2),
+        pytest.param(range(2, 5), marks=pytest.mark.slow),
+        pytest.param(range(5, 48), marks=pytest.mark.faults),
+    ],
+)
+@pytest.mark.parametrize(
+    "layout",
+    ["raw", *(pytest.param(name, marks=pytest.mark.slow) for name in ("odometry", "table")), "moving"],
+)
 def test_nothing_is_lost_on_random_damage(
-    layout: str, clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
+    layout: str, seeds: range, clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
 ) -> None:
-    for seed in range(4):
-        conserve(clean, layout, seed, trial, tmp_path)
-
-
-@pytest.mark.faults
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_nothing_is_lost_on_much_random_damage(
-    layout: str, clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
-) -> None:
-    for seed in range(4, 47):
+    for seed in seeds:
         conserve(clean, layout, seed, trial, tmp_path)
 
 
@@ -175,6 +177,7 @@ WRITTEN = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_map_without_labels_but_with_movers_is_written(
     clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
 ) -> None:
@@ -186,6 +189,7 @@ def test_a_map_without_labels_but_with_movers_is_written(
     trial("whole runs", outcome.faults, outcome)
 
 
+@pytest.mark.slow
 def test_all_label_files_damaged_is_said_early_and_one_is_a_skip(
     clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
 ) -> None:

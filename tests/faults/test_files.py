@@ -148,7 +148,6 @@ def test_a_command_says_it_in_one_line(layout, name, instead, drives, trial, tmp
     outcome = gnss_sem_map(
         "trajectory", drive, "-o", tmp_path / "out", "--set", "trajectory.lidar_odometry=false",
         folder=tmp_path / "run",
-        timeout_s=60,
     )  # fmt: skip
     trial("files", outcome.faults, outcome)
 

@@ -11,19 +11,16 @@ from faults.readers import READERS
 QUICK, WHOLE = 20, 2000
 
 
-def _check(name: str, first: int, count: int, trial, folder: Path) -> None:
-    report = fuzz(READERS[name], name, first, count, folder)
+@pytest.mark.parametrize(
+    ("first", "count"),
+    [(0, QUICK), pytest.param(QUICK, WHOLE, marks=pytest.mark.faults)],
+    ids=["some", "many"],
+)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (n % 8 > 0)) for n, name in enumerate(READERS)]
+)
+def test_damaged_files_are_read_or_refused(name: str, first: int, count: int, trial, tmp_path: Path) -> None:
+    report = fuzz(READERS[name], name, first, count, tmp_path)
     figures = f"{report.inputs} | {report.refused} | {report.slowest_s:.2f} s | {report.peak_mb:.0f} MB"
     print(f"\n| {name} | {figures} |")  # noqa: T201 (a table, where pytest shows output: -s)
     trial("fuzzing", report.faults[:10])
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_some_damaged_files_are_read_or_refused(name: str, trial, tmp_path: Path) -> None:
-    _check(name, 0, QUICK, trial, tmp_path)
-
-
-@pytest.mark.faults
-@pytest.mark.parametrize("name", READERS)
-def test_many_damaged_files_are_read_or_refused(name: str, trial, tmp_path: Path) -> None:
-    _check(name, QUICK, WHOLE, trial, tmp_path)

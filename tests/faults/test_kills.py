@@ -66,7 +66,7 @@ def neighbours(folder: Path) -> dict[str, str]:
     return content(folder)
 
 
-@pytest.mark.parametrize("listed", [True, False])
+@pytest.mark.parametrize("listed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_result_is_replaced_whole_whenever_it_is_killed(
     results, listed: bool, trial, tmp_path: Path
 ) -> None:
@@ -134,11 +134,14 @@ def at_once(small_drive: Street):
     return build_maps(street_drive(small_drive.drive, small_drive.labels), stats), stats
 
 
-def kill_the_mapping(
-    small_drive: Street, at_once, trial: Callable[..., None], folder: Path, step: int
+@pytest.mark.parametrize(
+    "step", [pytest.param(17, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.faults)]
+)
+def test_a_mapping_that_is_killed_goes_on_to_the_same_bytes(
+    small_drive: Street, at_once, step: int, trial: Callable[..., None], tmp_path: Path
 ) -> None:
     for number in range(1, MOST_CHANGES, step):
-        work = folder / f"work{number}"
+        work = tmp_path / f"work{number}"
         died = killed_before_change(number, work, map_street, small_drive.drive, small_drive.labels, work)
         assert_same_chunks(small_drive, work, at_once)
         trial("kill while mapping")
@@ -147,30 +150,22 @@ def kill_the_mapping(
     assert number > 30
 
 
-def test_a_mapping_that_is_killed_goes_on_to_the_same_bytes(
-    small_drive, at_once, trial, tmp_path: Path
-) -> None:
-    kill_the_mapping(small_drive, at_once, trial, tmp_path, step=17)
-
-
-@pytest.mark.faults
-def test_a_mapping_killed_at_every_second_change_goes_on_to_the_same_bytes(
-    small_drive, at_once, trial, tmp_path: Path
-) -> None:
-    kill_the_mapping(small_drive, at_once, trial, tmp_path, step=2)
-
-
 def clear_work(work: Path) -> None:
     from gnss_sem_map.files import work_folder
 
     work_folder.clear(work)
 
 
-def kill_the_clean_up(small_drive: Street, at_once, trial, folder: Path, step: int) -> None:
-    map_street(small_drive.drive, small_drive.labels, folder / "mapped")
+@pytest.mark.parametrize(
+    "step", [pytest.param(7, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.faults)]
+)
+def test_a_clean_up_that_is_killed_is_not_mistaken_for_work(
+    small_drive: Street, at_once, step: int, trial: Callable[..., None], tmp_path: Path
+) -> None:
+    map_street(small_drive.drive, small_drive.labels, tmp_path / "mapped")
     for number in range(1, MOST_CHANGES, step):
-        work = folder / f"work{number}"
-        shutil.copytree(folder / "mapped", work)
+        work = tmp_path / f"work{number}"
+        shutil.copytree(tmp_path / "mapped", work)
         died = killed_before_change(number, work, clear_work, work)
         assert_same_chunks(small_drive, work, at_once)
         trial("kill while cleaning up")
@@ -178,19 +173,6 @@ def kill_the_clean_up(small_drive: Street, at_once, trial, folder: Path, step: i
         if not died:
             break
     assert number > 15
-
-
-def test_a_clean_up_that_is_killed_is_not_mistaken_for_work(
-    small_drive, at_once, trial, tmp_path: Path
-) -> None:
-    kill_the_clean_up(small_drive, at_once, trial, tmp_path, step=7)
-
-
-@pytest.mark.faults
-def test_a_clean_up_killed_at_every_change_is_not_mistaken_for_work(
-    small_drive, at_once, trial, tmp_path: Path
-) -> None:
-    kill_the_clean_up(small_drive, at_once, trial, tmp_path, step=1)
 
 
 def run_words(small_drive: Street, out: Path, *more: str) -> tuple[str, ...]:
@@ -228,12 +210,6 @@ def kill_a_run(small_drive: Street, whole, trial, folder: Path, after_s: float) 
     beside = sorted(path.name for path in folder.iterdir() if not path.name.startswith(("trial", "last")))
     faults += [f"left beside: {beside}"] * (beside != ["out"])
     trial("kill a run", faults, outcome)
-
-
-def test_a_run_that_is_killed_and_resumed_gives_the_same_bytes(
-    small_drive, whole, trial, tmp_path: Path
-) -> None:
-    kill_a_run(small_drive, whole, trial, tmp_path, 2.5)
 
 
 @pytest.mark.faults

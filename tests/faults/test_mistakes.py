@@ -172,7 +172,11 @@ def test_a_good_simulated_drive_is_not_red(seed: int, simulated, trial) -> None:
 
 
 @pytest.mark.parametrize(
-    "drive", [f"kitti_raw/2011_09_26/{REAL}", "semantic_kitti/sequences/00", "semantic_kitti/sequences/08"]
+    "drive",
+    [
+        f"kitti_raw/2011_09_26/{REAL}",
+        *(pytest.param(f"semantic_kitti/sequences/{n}", marks=pytest.mark.slow) for n in ("00", "08")),
+    ],
 )
 def test_a_good_real_drive_is_not_red(real_data: Path, drive: str, trial) -> None:
     page, refusal = page_of(real_data / drive)

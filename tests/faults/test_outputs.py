@@ -43,7 +43,7 @@ FOREIGN: dict[str, Callable[[Path], None]] = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-@pytest.mark.parametrize("listed", [True, False])
+@pytest.mark.parametrize("listed", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "command",
     ["trajectory", *(pytest.param(name, marks=pytest.mark.faults) for name in ("run", "demo"))],
@@ -103,7 +103,7 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("place", INPUTS)
-@pytest.mark.parametrize("linked", [False, True])
+@pytest.mark.parametrize("linked", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_input_is_never_a_place_for_results(
     own_street: Street, place: str, linked: bool, trial, tmp_path: Path
 ) -> None:
@@ -175,6 +175,7 @@ def test_notes_in_the_folder_of_an_interrupted_run_stay(small_drive: Street, tri
         trial("neighbours", refused(outcome, before, work.parent, name.split("/")[0]), outcome)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_without_its_fingerprint_blocks_nobody(small_drive, trial, tmp_path: Path) -> None:
     work = tmp_path / "place" / ".out.work"
     write_result(work, {})
@@ -186,6 +187,7 @@ def test_an_interrupted_run_without_its_fingerprint_blocks_nobody(small_drive, t
     trial("left by an interrupted run", faults, outcome)
 
 
+@pytest.mark.slow
 def test_a_link_is_followed(small_drive: Street, trial, tmp_path: Path) -> None:
     place = tmp_path / "disk"
     place.mkdir()
@@ -283,6 +285,7 @@ def test_a_lock_that_is_none_is_not_touched(small_drive: Street, trial, tmp_path
         lock.rmdir() if lock.is_dir() and not lock.is_symlink() else lock.unlink()
 
 
+@pytest.mark.slow
 def test_other_commands_write_over_nothing_that_is_not_theirs(small_drive, trial, tmp_path: Path) -> None:
     place = tmp_path / "place"
     place.mkdir()

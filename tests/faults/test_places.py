@@ -81,6 +81,7 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
         yield tmp_path / "disk"
 
 
+@pytest.mark.slow
 def test_a_mount_point_is_refused_and_a_folder_on_it_is_not(
     small_drive, tiny_disk: Path, trial, tmp_path: Path
 ) -> None:
@@ -93,7 +94,9 @@ def test_a_mount_point_is_refused_and_a_folder_on_it_is_not(
     assert os.listdir(tiny_disk) == ["out"]
 
 
-@pytest.mark.parametrize("file_mb", [0.0005, 0.001, 0.003, 0.02])
+@pytest.mark.parametrize(
+    "file_mb", [0.001, *(pytest.param(mb, marks=pytest.mark.slow) for mb in (0.0005, 0.003, 0.02))]
+)
 def test_a_full_disk_leaves_the_earlier_result(small_drive, file_mb: float, trial, tmp_path: Path) -> None:
     out = tmp_path / "place" / "out"
     write_result(out, RUN)
@@ -105,7 +108,7 @@ def test_a_full_disk_leaves_the_earlier_result(small_drive, file_mb: float, tria
     trial("full disk", faults, outcome)
 
 
-@pytest.mark.parametrize("words", [("--json",), ()])
+@pytest.mark.parametrize("words", [("--json",), pytest.param((), marks=pytest.mark.slow)])
 def test_a_full_stdout_is_one_line(small_drive: Street, words, trial, tmp_path: Path) -> None:
     outcome = gnss_sem_map(
         "trajectory", small_drive.drive, "-o", tmp_path / "out", *words, folder=tmp_path / "trial",

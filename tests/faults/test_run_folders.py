@@ -98,7 +98,12 @@ def _damaged(out: Path, name: str, damage: Callable[[Path], None], folder: Path)
     return copy
 
 
-@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "damage",
+    DAMAGES,
+    ids=lambda damage: damage.__name__,
+)
 @pytest.mark.parametrize("name", FILES)
 def test_a_damaged_run_gives_our_own_errors(name, damage, made, trial, tmp_path: Path) -> None:
     out, truth = made
@@ -133,6 +138,7 @@ def test_a_command_says_in_one_line_that_a_run_is_damaged(name, damage, made, tr
         trial("run folders", outcome.faults, outcome)
 
 
+@pytest.mark.slow
 def test_a_python_segmenter_that_only_a_run_names_is_not_opened(made, trial, tmp_path: Path) -> None:
     out, truth = made
     copy = tmp_path / "out"

@@ -36,16 +36,21 @@ def stop(
 
 @pytest.mark.parametrize(
     ("number", "after_s"),
-    [(signal.SIGINT, 0.3), (signal.SIGTERM, 1.5), (signal.SIGHUP, 3.0), (signal.SIGINT, 4.0)],
+    [
+        (signal.SIGTERM, 1.5),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((signal.SIGINT, 0.3), (signal.SIGHUP, 3.0))),
+    ],
 )
 def test_a_signal_is_one_line(small_drive: Street, number, after_s: float, trial, tmp_path: Path) -> None:
     trial("signals", *stop(small_drive, number, after_s, tmp_path))
 
 
+@pytest.mark.slow
 def test_a_signal_to_all_workers_is_one_line(small_drive: Street, trial, tmp_path: Path) -> None:
     trial("signals", *stop(small_drive, signal.SIGINT, 5.0, tmp_path, "--workers", "2"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "after_s"), [("segment", 2.0), ("run", 6.0)])
 def test_a_signal_ends_a_network_that_never_answers(
     small_drive: Street, command: str, after_s: float, trial, tmp_path: Path

@@ -285,8 +285,6 @@ def test_a_trajectory_with_one_absurd_stamp_takes_no_memory(
     name, value, copies, trial, tmp_path: Path
 ) -> None:
     _change_cell(copies["table"] / name, 3, 1 if "stamps" in name else 0, value)
-    outcome = gnss_sem_map(
-        "trajectory", copies["table"], "-o", tmp_path / "out", folder=tmp_path / "run", timeout_s=100
-    )
+    outcome = gnss_sem_map("trajectory", copies["table"], "-o", tmp_path / "out", folder=tmp_path / "run")
     slow = [f"{outcome.peak_mb:.0f} MB"] if outcome.peak_mb > 1500 else []
     trial("stamps", [*outcome.faults, *slow], outcome)

@@ -125,6 +125,7 @@ def test_a_mover_is_no_look_at_the_static_voxels_that_it_passes(finished: Run) -
     assert alone != with_mover  # so the comparison above would tell them apart
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes(drive: Path, finished: Run, tmp_path: Path) -> None:
     again = run(
         drive, tmp_path / "out", write_labels=True, force=True, workers=2,
@@ -141,6 +142,7 @@ def test_two_workers_write_the_same_bytes(drive: Path, finished: Run, tmp_path: 
     assert not list(one.folder.glob(".sightings*"))
 
 
+@pytest.mark.slow
 def test_copc_has_them_and_another_export_too(finished: Run, tmp_path: Path) -> None:
     copc, laz = finished.export(["copc", "laz"], tmp_path / "files")
     assert laz.read_bytes() == (finished.folder / "map.laz").read_bytes()
@@ -162,12 +164,14 @@ def test_attributes_of_another_map_are_refused(finished: Run, tmp_path: Path) ->
         Run.open(tmp_path / "run").export(["laz"], tmp_path / "files")
 
 
+@pytest.mark.slow
 def test_a_plain_run_has_them_too(drive: Path, finished: Run, tmp_path: Path) -> None:
     bare = run(drive, tmp_path / "out", force=True)
     for name in ("map.laz", "removed.laz"):
         assert (bare.folder / name).read_bytes() == (finished.folder / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_without_them_gps_time_and_intensity_are_0(finished: Run, tmp_path: Path) -> None:
     shutil.copytree(finished.folder, tmp_path / "run")
     shutil.rmtree(tmp_path / "run/attributes")  # as older versions wrote runs
@@ -178,6 +182,7 @@ def test_without_them_gps_time_and_intensity_are_0(finished: Run, tmp_path: Path
     assert las.header.global_encoding.gps_time_type == laspy.header.GpsTimeType.WEEK_TIME
 
 
+@pytest.mark.slow
 def test_of_several_drives_the_last_that_saw_a_voxel_counts(tmp_path: Path) -> None:
     drives = street_drives.write(tmp_path / "drives")
     how, out = HowMapped(drives.labels, force=True), tmp_path / "out"

@@ -82,13 +82,11 @@ def between(days: list[Path], tracks: list[Trajectory], frame: LocalFrame) -> tu
     return found[1] - found[0][near], at[1] - at[0][near]
 
 
-def tracks_in(out: Path, days: list[Path]) -> list[Trajectory]:
-    return [Trajectory.load(out / "drives" / drive.name / "trajectory.parquet") for drive in days]
+def tracks_in(out: Path, days: list[Path], file: str = "trajectory") -> list[Trajectory]:
+    return [Trajectory.load(out / "drives" / drive.name / f"{file}.parquet") for drive in days]
 
 
-def test_both_days_lie_to_each_other_as_they_were_driven(
-    days: list[Path], both: Path, tmp_path: Path
-) -> None:
+def test_both_days_lie_to_each_other_as_they_were_driven(days: list[Path], both: Path) -> None:
     about = read_run(both)
     (row,) = about["passes"]
     assert [row["first"], row["second"]] == [drive.name for drive in days]
@@ -97,18 +95,26 @@ def test_both_days_lie_to_each_other_as_they_were_driven(
     frame = LocalFrame(**about["local_frame"])
     found, true = between(days, tracks_in(both, days), frame)
     assert np.linalg.norm(found - true, axis=1).max() < 0.03
+    found, true = between(days, tracks_in(both, days, "trajectory_alone"), frame)
+    assert np.linalg.norm(found - true, axis=1).min() > 0.1, "they come together by themselves"
 
+
+@pytest.mark.slow
+def test_without_revisits_they_lie_apart(days: list[Path], both: Path, tmp_path: Path) -> None:
     apart = Settings.model_validate({"trajectory": {"revisits": {"enabled": False}}})
     run_drives(days, tmp_path / "apart", apart, HOW)
     assert read_run(tmp_path / "apart")["passes"] == []
-    found, true = between(days, tracks_in(tmp_path / "apart", days), frame)
-    assert np.linalg.norm(found - true, axis=1).min() > 0.1
+    for track, alone in zip(
+        tracks_in(tmp_path / "apart", days), tracks_in(both, days, "trajectory_alone"), strict=True
+    ):
+        np.testing.assert_array_equal(track.positions, alone.positions)
 
 
 def stopped(*_: object, **__: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_a_day_that_is_added_moves_the_first_one_as_a_run_of_both_does(
     days: list[Path], both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,6 +300,7 @@ def test_what_changed_is_in_the_truth_and_in_the_files(days: list[Path], both: P
         assert (places <= ring.max(axis=0) + slack).all()
 
 
+@pytest.mark.slow
 def test_the_viewer_shows_what_changed_and_all_of_it_stays_when_the_map_is_refined_again(
     both: Path, tmp_path: Path
 ) -> None:

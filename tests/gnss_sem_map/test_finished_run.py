@@ -78,6 +78,7 @@ def test_the_report_tells_of_everything_that_lies_beside_it(finished: Run) -> No
     assert there - told == {"report.html"}
 
 
+@pytest.mark.slow
 def test_notebooks_say_the_same_figures_as_the_report(
     finished: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,6 +134,7 @@ def test_refined_with_another_setting_it_is_what_a_run_with_that_setting_makes(
     assert files(again.folder / "refined") != files(finished.folder / "refined")
 
 
+@pytest.mark.slow
 def test_refining_needs_no_drive_where_there_are_no_point_labels_and_works_in_place(
     finished: Run, tmp_path: Path
 ) -> None:
@@ -176,6 +178,7 @@ def test_relabelled_it_is_what_a_run_with_those_labels_makes(
     assert again.about["inputs"]["segmenter"] == finished.about["inputs"]["segmenter"]
 
 
+@pytest.mark.slow
 def test_relabelled_it_says_what_a_run_with_those_labels_says_of_them(
     small_drive: Street, tmp_path: Path
 ) -> None:
@@ -190,6 +193,7 @@ def test_relabelled_it_says_what_a_run_with_those_labels_says_of_them(
     assert not any("geometry only" in said for said in again.about["warnings"])
 
 
+@pytest.mark.slow
 def test_class_names_that_nobody_knows_are_said_once(small_drive: Street, tmp_path: Path) -> None:
     labels = shutil.copytree(small_drive.labels, tmp_path / "labels")
     for path in labels.iterdir():
@@ -207,6 +211,7 @@ def test_class_names_that_nobody_knows_are_said_once(small_drive: Street, tmp_pa
     assert files(again.folder / "map") == files(once.folder / "map")
 
 
+@pytest.mark.slow
 def test_it_warns_of_what_the_classifier_leaves_without_a_class_and_of_nothing_else(
     finished: Run, small_drive: Street, tmp_path: Path
 ) -> None:
@@ -224,6 +229,7 @@ def test_it_warns_of_what_the_classifier_leaves_without_a_class_and_of_nothing_e
     assert classified.refine(bare.settings, tmp_path / "back").about["warnings"] == bare.about["warnings"]
 
 
+@pytest.mark.slow
 def test_relabelled_it_stays_where_it_was(finished: Run, small_drive: Street, tmp_path: Path) -> None:
     assert finished.frame is not None
     origin = replace(finished.frame, lat_deg=finished.frame.lat_deg + 0.001)
@@ -258,19 +264,23 @@ def test_it_is_exported_again_and_nothing_of_others_is_written_over(finished: Ru
         with pytest.raises(ConfigError, match=r"delivery\."):
             finished.export(["laz"], tmp_path / "new" / "files", delivery)
     assert not (tmp_path / "new").exists()
-    before = (finished.folder / "map.ply").read_bytes()
-    [ply] = finished.export(["ply"])
+    out = Run.open(shutil.copytree(finished.folder, tmp_path / "out"))
+    before = (out.folder / "map.ply").read_bytes()
+    [ply] = out.export(["ply"])
     assert ply.read_bytes() == before
 
 
-def test_it_is_exported_neither_into_itself_nor_while_another_command_writes_it(finished: Run) -> None:
+def test_it_is_exported_neither_into_itself_nor_while_another_command_writes_it(
+    finished: Run, tmp_path: Path
+) -> None:
+    out = Run.open(shutil.copytree(finished.folder, tmp_path / "out"))
     with pytest.raises(DataError, match=r"inside: lies in .*, which is read; choose an -o outside$"):
-        finished.export(["laz"], finished.folder / "inside")
+        out.export(["laz"], out.folder / "inside")
     with (
-        locked(finished.folder),
+        locked(out.folder),
         pytest.raises(DataError, match=r"gnss-sem-map writes it now .*; wait for it"),
     ):
-        finished.export(["laz"])
+        out.export(["laz"])
 
 
 def replaced(out: Path, **files: str) -> None:
@@ -281,7 +291,10 @@ def replaced(out: Path, **files: str) -> None:
             (folder / f"{name}.yaml").write_text(text)
 
 
-@pytest.mark.parametrize("command", ["refine", "relabel", "export", "calibrate"])
+@pytest.mark.parametrize(
+    "command",
+    ["export", *(pytest.param(name, marks=pytest.mark.slow) for name in ("refine", "relabel", "calibrate"))],
+)
 def test_a_run_that_another_command_replaces_while_it_is_read_is_no_source(
     command: str, finished: Run, small_drive: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -401,6 +414,7 @@ def test_moving_points_are_read_as_scans_need_them_though_one_was_skipped(
     assert len(paths) >= 3
 
 
+@pytest.mark.slow
 def test_the_coordinates_of_all_files_change_together_and_the_map_stays(
     finished: Run, tmp_path: Path
 ) -> None:

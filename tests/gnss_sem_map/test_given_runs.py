@@ -75,6 +75,7 @@ def test_the_parquet_of_a_run_gives_the_same_bytes(table: Path, smoothed: Path, 
     assert tiles_of(tmp_path / "out") == tiles_of(smoothed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trajectory.tum", "trajectory.sbet"])
 def test_its_other_files_give_the_same_voxels_but_for_their_digits(
     table: Path, smoothed: Path, tmp_path: Path, name: str
@@ -84,6 +85,7 @@ def test_its_other_files_give_the_same_voxels_but_for_their_digits(
     assert len(found ^ known) <= 1e-3 * len(known)
 
 
+@pytest.mark.slow
 def test_the_truth_gives_a_map_that_is_not_less_sharp(
     table: Path, smoothed: Path, truth_file: Path, tmp_path: Path
 ) -> None:
@@ -100,6 +102,7 @@ def scans_alone(table: Path, folder: Path) -> Path:
     return folder / "alone"
 
 
+@pytest.mark.slow
 def test_scans_alone_become_the_same_map(table: Path, truth_file: Path, tmp_path: Path) -> None:
     whole = run(table, tmp_path / "whole", trajectory=truth_file, force=True)
     drive = scans_alone(table, tmp_path)
@@ -112,6 +115,7 @@ def test_scans_alone_become_the_same_map(table: Path, truth_file: Path, tmp_path
     assert voxels_of(made.folder) == voxels_of(whole.folder)
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_where_the_files_content_is_the_same(
     table: Path, truth: Trajectory, tmp_path: Path
 ) -> None:
@@ -129,6 +133,7 @@ def test_a_run_is_resumed_where_the_files_content_is_the_same(
     assert made(True) != first
 
 
+@pytest.mark.slow
 def test_a_run_is_relabelled_when_the_file_is_gone(
     small_drive: street.Street, table: Path, truth: Trajectory, tmp_path: Path
 ) -> None:
@@ -141,6 +146,7 @@ def test_a_run_is_relabelled_when_the_file_is_gone(
     assert sum(again.about["map"]["labelled"]["raw"].values()) > 0
 
 
+@pytest.mark.slow
 def test_a_drive_with_a_trajectory_is_added(
     table: Path, truth: Trajectory, truth_file: Path, smoothed: Path, tmp_path: Path
 ) -> None:

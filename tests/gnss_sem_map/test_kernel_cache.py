@@ -71,11 +71,13 @@ def test_kernels_are_compiled_once_into_a_folder_of_this_user(start: Start, tmp_
         assert f"kernels are compiled into {folder}; NUMBA_CACHE_DIR names another folder" in said
 
 
+@pytest.mark.slow
 def test_what_was_compiled_ahead_is_used(start: Start) -> None:
     done = start("-c", CALL, compiled_ahead=True)
     assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trap", ["open to all", "a link"])
 def test_a_folder_that_others_may_have_filled_is_not_taken(start: Start, tmp_path: Path, trap: str) -> None:
     planted = tmp_path / "temporary" / f"{PREFIX}0"
@@ -91,6 +93,7 @@ def test_a_folder_that_others_may_have_filled_is_not_taken(start: Start, tmp_pat
     assert f"{planted};" not in done.stderr
 
 
+@pytest.mark.slow
 def test_a_folder_that_the_user_names_is_taken_without_a_word(start: Start, tmp_path: Path) -> None:
     done = start("-c", CALL, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
     assert (done.returncode, done.stderr) == (0, "")

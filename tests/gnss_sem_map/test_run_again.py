@@ -164,6 +164,7 @@ def test_a_killed_run_is_resumed_by_two_processes_and_keeps_what_it_had(
     assert_same_maps(out, whole)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_while_it_is_refined_keeps_the_blocks_that_it_had(
     small_drive: Street, live: Path, tmp_path: Path
 ) -> None:
@@ -197,11 +198,12 @@ def live(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("moment", "before"),
     [
         pytest.param({"die_at_question": 7}, 6, id="asking"),
-        pytest.param({"die_before_chunk": 2}, 12, id="mapping", marks=pytest.mark.slow),
+        pytest.param({"die_before_chunk": 2}, 12, id="mapping"),
     ],
 )
 def test_a_resumed_run_asks_the_network_for_no_image_twice(

@@ -73,11 +73,11 @@ except Stopped as stopped:
     ("place", "printed"),
     [
         ("interrupt", "15"),
-        ("InFinalizer", "15"),
+        pytest.param("InFinalizer", "15", marks=pytest.mark.slow),
         ("in_a_callback", "15"),
         ("while_a_lock_is_taken", "given back 15"),
-        ("while_a_member_is_opened", "15"),
-        ("while_a_plot_is_drawn", "15"),
+        pytest.param("while_a_member_is_opened", "15", marks=pytest.mark.slow),
+        pytest.param("while_a_plot_is_drawn", "15", marks=pytest.mark.slow),
         ("while_it_waits", "15"),
     ],
 )
@@ -99,7 +99,7 @@ def test_an_import_is_finished_first(tmp_path: Path) -> None:
         "except Stopped as stopped:\n    print(stopped.number, len(sys.modules['halfway'].numbers))\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=600
     )
     assert done.stdout.split() == [str(int(signal.SIGTERM)), "100000"]
 
@@ -126,6 +126,7 @@ except signals.Stopped as stopped:
 """
 
 
+@pytest.mark.slow
 def test_a_signal_while_a_function_is_compiled_or_loaded_crashes_nothing(tmp_path: Path) -> None:
     """LLVM goes on without a function whose loading raised an exception, and a call of it would crash."""
     for _ in ("compiled", "loaded from the cache"):
@@ -135,7 +136,7 @@ def test_a_signal_while_a_function_is_compiled_or_loaded_crashes_nothing(tmp_pat
             capture_output=True,
             text=True,
             check=False,
-            timeout=300,
+            timeout=600,
         )
         assert (ended.returncode, ended.stdout.split(), ended.stderr) == (0, ["15"], "")
 
@@ -187,9 +188,10 @@ for line in range(1, lines + 1):
 """
 
 
+@pytest.mark.slow
 def test_a_signal_at_any_line_of_claiming_a_folder_leaves_no_lock_and_no_work_folder(tmp_path: Path) -> None:
     program = [sys.executable, "-c", CLAIM, str(tmp_path)]
-    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=300)
+    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=600)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "out/result").is_file()
 
@@ -217,6 +219,6 @@ main()
 
 def test_an_error_that_a_signal_caused_is_that_signal() -> None:
     program = [sys.executable, "-c", SWALLOWED]
-    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=60)
+    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=600)
     assert ended.returncode == 128 + signal.SIGTERM
     assert ended.stderr == "gnss-sem-map: stopped by SIGTERM; what was done is kept\n"

@@ -193,6 +193,7 @@ def test_a_car_that_creeps_a_third_of_its_length_goes(lengths):
     assert others < 2e-4
 
 
+@pytest.mark.slow
 def test_a_car_that_creeps_past_parked_cars_takes_nothing_of_them_along():
     """It passes so closely that it is one segment with them for some scans."""
     creeping = going(16, 4.5 - CAR[1] - 0.3, 0.5)
@@ -202,6 +203,7 @@ def test_a_car_that_creeps_past_parked_cars_takes_nothing_of_them_along():
     assert others == 0
 
 
+@pytest.mark.slow
 def test_a_car_that_comes_closer_for_a_metre_and_waits_goes():
     """It hides the place that it left, and nearly all scans hit it where it waits."""
     share, others, _ = drive([*ROW, going(-9, 0, 3.0, stop=0.4)], scans=70, ego_speed=0.0, view_deg=0.0)
@@ -210,6 +212,7 @@ def test_a_car_that_comes_closer_for_a_metre_and_waits_goes():
     assert others < 2e-4
 
 
+@pytest.mark.slow
 def test_a_car_that_no_scan_is_near_is_told_by_those_farther_away():
     """It comes from 62 m to 47 m, where no scan is within `farthest_m`; the lowest ring is too far from the next."""
     share, others, _ = drive([going(62, -3.5, -5.0), parked(60, 4.5)], scans=30, ego_speed=0.0)
@@ -217,7 +220,7 @@ def test_a_car_that_no_scan_is_near_is_told_by_those_farther_away():
     assert (share[1], others) == (0, 0)
 
 
-@pytest.mark.parametrize("start", [2.0, 2.9])
+@pytest.mark.parametrize("start", [2.0, pytest.param(2.9, marks=pytest.mark.slow)])
 def test_what_no_image_shows_goes_however_short_the_drive(start):
     """Half a second of driving of its own is enough; and the row of parked cars stays."""
     share, others, _ = drive([*ROW, going(20, -3.5, -6.0, start=start)], scans=40, view_deg=0.0)
@@ -252,7 +255,7 @@ def test_a_drive_that_stands_still_tells_movers_from_parked_cars():
     assert others < 2e-4
 
 
-@pytest.mark.parametrize("y", [-10.35, 11.35])
+@pytest.mark.parametrize("y", [-10.35, pytest.param(11.35, marks=pytest.mark.slow)])
 def test_a_person_close_to_a_wall_goes_and_the_wall_stays_whole(y):
     """20 cm lie between them: no cluster tells them apart, and no image."""
     share, others, objects = drive([going(8, y, 1.4)], view_deg=0.0, size=PERSON)

@@ -15,7 +15,7 @@ from processes import wait_until
 from street_drives import Drives
 
 pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
 
 def test_a_run_whose_command_is_killed_is_resumed_while_workers_are_still_busy(
@@ -26,7 +26,7 @@ def test_a_run_whose_command_is_killed_is_resumed_while_workers_are_still_busy(
     with two_workers(cluster) as address:
         words = run_of([drives.by_name["a"], drives.by_name["b"]], drives, out, "--scheduler", address)
         running = subprocess.Popen(command(*words), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert wait_until(lambda: any(work.glob("drives/.*.work/chunks.json")), within_s=120)
+        assert wait_until(lambda: any(work.glob("drives/.*.work/chunks.json")))
         running.kill()
         assert running.wait() == -signal.SIGKILL
         assert not (work / "drives/a/run.json").exists()

@@ -91,6 +91,7 @@ def test_a_drive_that_kills_its_workers_is_left_out(
     assert made.failed["c"].startswith("given up after 3 attempts: 3 x a worker process died (SIGKILL")
 
 
+@pytest.mark.slow
 def test_an_error_of_the_disk_in_one_drive_leaves_the_others(
     drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,6 +144,7 @@ def test_labels_in_a_result_that_would_be_replaced_are_not_removed(
     assert (out / "labels/a").is_dir()
 
 
+@pytest.mark.slow
 def test_a_drive_of_a_map_can_be_scored_and_the_map_stays_ours(
     drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -184,6 +186,7 @@ def test_a_drive_is_counted_once_whatever_its_name(
         assert products(out) == products(made[before])
 
 
+@pytest.mark.slow
 def test_a_drive_has_the_name_of_its_folder_also_where_we_stand_in_it(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +196,7 @@ def test_a_drive_has_the_name_of_its_folder_also_where_we_stand_in_it(
     assert_same(out, made["ab"])
 
 
+@pytest.mark.slow
 def test_a_drive_without_georeference_fits_into_no_map(
     drives: Drives, small_drive: Street, how: HowMapped, tmp_path: Path
 ) -> None:

@@ -84,6 +84,7 @@ def stop_of(run: Callable[[], object], module: ModuleType, name: str) -> Keyboar
     return stopping.value
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_in_its_first_drive_keeps_the_chunks(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -110,6 +111,7 @@ def calls_of_the_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return calls
 
 
+@pytest.mark.slow
 def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,6 +148,7 @@ def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(
         assert len(calls) == times
 
 
+@pytest.mark.slow
 def test_what_is_damaged_of_an_interrupted_run_is_made_again(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,7 +194,8 @@ def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
     assert not work.exists()
 
 
-@pytest.mark.parametrize("names", ["a", pytest.param("ab", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("names", ["a", "ab"])
 def test_a_run_that_was_stopped_when_the_map_was_there_does_nothing_twice(
     names: str, made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -241,6 +245,7 @@ def test_commands_find_the_result_that_a_killed_one_had_moved_away(
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 def test_a_drive_that_two_workers_write_at_once_is_there_once(drives: Drives, tmp_path: Path) -> None:
     """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
     job, words = stopped_before_it_is_written(drives, tmp_path)
@@ -251,6 +256,7 @@ def test_a_drive_that_two_workers_write_at_once_is_there_once(drives: Drives, tm
     assert sorted(path.name for path in job.made.parent.iterdir()) == [".a.work", "a"]
 
 
+@pytest.mark.slow
 def test_a_task_of_a_run_that_was_followed_by_another_one_does_nothing(
     drives: Drives, tmp_path: Path
 ) -> None:
@@ -291,6 +297,7 @@ def test_a_removal_that_was_stopped_when_the_map_was_there_does_nothing_twice(
         remove_drive(out, "c", resume=True)
 
 
+@pytest.mark.slow
 def test_a_name_that_is_not_in_the_map_leaves_what_another_command_has_done(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:

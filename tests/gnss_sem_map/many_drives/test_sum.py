@@ -73,7 +73,9 @@ def test_viewer_and_report_show_every_drive(made: dict[str, Path]) -> None:
     assert all(f'href="drives/{name}/report.html"' in report for name in "abc")
 
 
-@pytest.mark.parametrize(("before", "name", "after"), [("a", "b", "ab"), ("ab", "c", "abc")])
+@pytest.mark.parametrize(
+    ("before", "name", "after"), [("a", "b", "ab"), pytest.param("ab", "c", "abc", marks=pytest.mark.slow)]
+)
 def test_a_map_to_which_a_drive_was_added_is_that_of_all_at_once(
     before: str, name: str, after: str, made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -85,11 +87,18 @@ def test_a_map_to_which_a_drive_was_added_is_that_of_all_at_once(
 
 
 def test_a_map_from_which_a_drive_was_taken_is_that_of_the_others(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+    made: dict[str, Path], tmp_path: Path
 ) -> None:
     out = shutil.copytree(made["abc"], tmp_path / "out")
     remove_drive(out, "c", workers=2)
     assert_same(out, made["ab"])
+
+
+@pytest.mark.slow
+def test_a_map_from_which_its_first_drive_was_taken_stays_in_its_frame(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    out = shutil.copytree(made["ab"], tmp_path / "out")
     remove_drive(out, "a")
     frame = read_frame(made["ab"] / "map")
     run_drives([drives.by_name["b"]], tmp_path / "b", SETTINGS, how, origin=frame)
@@ -111,6 +120,7 @@ def test_a_map_of_many_drives_that_is_refined_again_keeps_its_drives(
     assert_same(out, made["abc"])
 
 
+@pytest.mark.slow
 def test_the_drives_of_a_map_have_its_settings_also_when_it_is_refined_with_others(
     made: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -121,12 +131,6 @@ def test_the_drives_of_a_map_have_its_settings_also_when_it_is_refined_with_othe
     ] * 2
     Run.open(out).refine(SETTINGS)
     assert_same(out, made["ab"])
-
-
-def test_a_map_of_many_drives_has_no_trajectory_and_cannot_be_relabelled(made: dict[str, Path]) -> None:
-    for asked in (lambda run: run.trajectory, lambda run: run.relabel("none")):
-        with pytest.raises(DataError, match="ab: is a map of a and b, expected a run of one drive"):
-            asked(Run.open(made["ab"]))
 
 
 def test_what_merge_of_an_earlier_version_left_is_refused_with_what_to_do(

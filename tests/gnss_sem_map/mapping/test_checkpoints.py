@@ -132,6 +132,7 @@ def assert_resumed(drive: Drive, at_once: tuple[Maps, RunStats], work: Path) -> 
     assert [path.name for path in work.glob(".*.*.*")] == [], "what the killed processes left stays"
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_a_killed_run_goes_on_to_the_same_map(
     drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path
@@ -179,7 +180,10 @@ def doubled(path: Path) -> None:
     tile.with_name("77_77.parquet").write_bytes(tile.read_bytes())
 
 
-@pytest.mark.parametrize("damage", [flipped, halved, doubled, Path.unlink])
+@pytest.mark.parametrize(
+    "damage",
+    [flipped, *(pytest.param(one, marks=pytest.mark.slow) for one in (halved, doubled, Path.unlink))],
+)
 @pytest.mark.parametrize("what", ["static/*.parquet", MOVING_POINTS, "record.json"])
 def test_a_damaged_chunk_is_mapped_again(
     drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, damage: Callable[[Path], None], what: str

@@ -6,7 +6,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import damage
 import numpy as np
@@ -18,22 +17,17 @@ from street import Street
 from street_drives import Drives
 from typer.testing import CliRunner
 
-from gnss_sem_map import Run, Settings, config, run
+from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import classifying, refining
+from gnss_sem_map.mapping import classifying
 from gnss_sem_map.mapping.classifying import FILE, DriveClassifier
-from gnss_sem_map.mapping.raw_map import open_raw
-from gnss_sem_map.process.execution import InProcess
-from gnss_sem_map.process.run_stats import silent
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
 from gnss_sem_map.voxels import blocks
-from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 pytestmark = pytest.mark.integration
 CLASSIFIER = Path("evidence", FILE)
-PAPER = Path(__file__).parents[3] / "examples" / "paper.yaml"
 
 
 def refined(out: Path) -> dict[str, bytes]:
@@ -102,12 +96,14 @@ def test_voxels_that_no_image_shows_get_the_class_they_have(street_run: Run) -> 
     assert ((found.confidence > 0) == (found.labels >= 0)).all()
 
 
+@pytest.mark.slow
 def test_a_run_refined_again_with_the_same_settings_is_the_same(street_run: Run, tmp_path: Path) -> None:
     again = street_run.refine(street_run.settings, tmp_path / "again")
     assert refined(again.folder) == refined(street_run.folder)
     assert (again.folder / CLASSIFIER).read_bytes() == (street_run.folder / CLASSIFIER).read_bytes()
 
 
+@pytest.mark.slow
 def test_switched_off_and_on_again(street_run: Run, tmp_path: Path) -> None:
     out = Path(shutil.copytree(street_run.folder, tmp_path / "out"))
     for value in ("false", "true"):
@@ -121,6 +117,7 @@ def test_switched_off_and_on_again(street_run: Run, tmp_path: Path) -> None:
     assert refined(out) == refined(street_run.folder)
 
 
+@pytest.mark.slow
 def test_a_damaged_classifier_is_made_again(street_run: Run, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(street_run.folder, tmp_path / "copy"))
     damage.halved(copy / CLASSIFIER)
@@ -129,6 +126,7 @@ def test_a_damaged_classifier_is_made_again(street_run: Run, tmp_path: Path) -> 
     assert refined(out) == refined(street_run.folder)
 
 
+@pytest.mark.slow
 def test_a_named_classifier_is_used_in_place_of_the_own_one(
     street_run: Run, model: Path, tmp_path: Path
 ) -> None:
@@ -151,6 +149,7 @@ def test_a_named_classifier_is_used_in_place_of_the_own_one(
     assert tiles_of(again.folder) == found[other], "the run has its own copy"
 
 
+@pytest.mark.slow
 def test_without_labels_of_images_a_named_classifier_gives_all_classes(
     street_run: Run, model: Path, tmp_path: Path
 ) -> None:
@@ -173,6 +172,7 @@ def test_without_labels_of_images_a_named_classifier_gives_all_classes(
     assert refined(made.folder) == refined(named.folder)
 
 
+@pytest.mark.slow
 def test_a_classifier_of_intensities_is_left_out_where_there_are_none(
     plain_run: Run, street_run: Run, model: Path, tmp_path: Path
 ) -> None:
@@ -190,6 +190,7 @@ def test_a_classifier_of_intensities_is_left_out_where_there_are_none(
     assert refined(own.folder) == refined(plain_run.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size_m", [3.0, 0.2])
 def test_too_few_labels_and_one_class_are_said_and_all_else_is_as_without(
     size_m: float, small_drive: Street, tmp_path: Path
@@ -221,7 +222,8 @@ def test_too_few_labels_and_one_class_are_said_and_all_else_is_as_without(
         np.testing.assert_array_equal(getattr(whole.map(), name), getattr(without.map(), name))
 
 
-@pytest.mark.parametrize("unit", [0.1, pytest.param(0.01, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [0.1, 0.01])
 def test_intensities_of_another_scale_have_the_same_ranks_as_far_as_they_are_told_apart(
     unit: float, street_run: Run, small_drive: Street, tmp_path: Path
 ) -> None:
@@ -274,21 +276,6 @@ def test_a_classifier_that_does_not_fit_is_refused_before_the_work(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_paper_s_settings_infer_nothing(small_drive: Street, tmp_path: Path) -> None:
-    settings = config.load(PAPER)
-    assert not settings.geometric_classifier.enabled
-    done = run(
-        small_drive.drive,
-        tmp_path / "out",
-        f"labels:{small_drive.labels}",
-        settings,
-        frames="0:6",
-        force=True,
-    )
-    assert not inferred(done.map()).any()
-    assert not (done.folder / CLASSIFIER).exists()
-
-
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
     """Two drives of one street."""
@@ -327,26 +314,6 @@ def test_an_added_drive_leaves_the_classifier_of_the_first_alone(
     assert refined(out) == refined(both)
 
 
-def test_a_drive_touches_only_the_blocks_around_it(
-    street_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A block is made again where the classifiers around it are others: those of drives beyond its halo are not."""
-    passed = {"near": [(0, 0), (1, 0)], "beside": [(2, 0)], "far": [(40, 0), (41, 0)]}
-    made = refining._Refinement(
-        open_raw(street_run.folder, URBAN), tmp_path, Settings(), silent, None, InProcess(), tmp_path
-    )
-    made.__dict__["_voxels"] = dict.fromkeys([(0, 0), (3, 0), (40, 0)], 1)
-    monkeypatch.setattr(refining, "files_of", lambda of: dict.fromkeys(map(name_of, passed[of.parent.name])))
-    found = {}
-    for names in (("near", "beside"), ("near", "beside", "far")):
-        drives = [SimpleNamespace(folder=tmp_path / name, digest=name) for name in names]
-        monkeypatch.setattr(refining, "drives_of", lambda *_, drives=drives: drives)
-        found[names] = made._classifier_digests()
-    before, after = found.values()
-    assert before == {((0, 0),): ["near"], ((3, 0),): ["beside"], ((40, 0),): []}
-    assert after == before | {((40, 0),): ["far"]}
-
-
 @pytest.mark.slow
 def test_drives_of_one_kind_make_one_classifier_and_others_are_refused(
     both: Path, street_run: Run, tmp_path: Path
@@ -372,6 +339,7 @@ def test_drives_of_one_kind_make_one_classifier_and_others_are_refused(
     assert file.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_runs_without_labels_teach_nothing(street_run: Run, tmp_path: Path) -> None:
     drive = Path(street_run.about["inputs"]["drive"])
     bare = run(drive, tmp_path / "bare", force=True, frames="0:6")

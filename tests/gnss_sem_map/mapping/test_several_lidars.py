@@ -110,6 +110,7 @@ def test_two_lidars_that_see_the_same_make_the_map_of_one_twice(moving: Drive) -
     assert_same(twice(one.removed), two.removed)
 
 
+@pytest.mark.slow
 def test_chunks_of_two_lidars_are_the_same_for_any_division(moving: Drive, tmp_path: Path) -> None:
     log = moving.log
     both = replace(moving, log=replace(log, lidar="a", others=(second(log, log.scans[2:]),)))

@@ -34,7 +34,13 @@ def right() -> SensorLog:
 
 
 @pytest.mark.parametrize(
-    ("seed", "seconds"), [(0, 3.0), (1, 20.0), (3, 20.0), (2, 60.0), (1, 150.0), (3, 150.0)]
+    ("seed", "seconds"),
+    [
+        (0, 3.0),
+        (1, 20.0),
+        (2, 60.0),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((3, 20.0), (1, 150.0), (3, 150.0))),
+    ],
 )
 def test_a_good_drive_is_green(seed: int, seconds: float) -> None:
     outages = [(seconds * 0.5, seconds * 0.7)] if seed % 2 else []
@@ -99,7 +105,9 @@ CASES: dict[str, tuple[Array, Array, str, SensorConventions]] = {
 }
 
 
-@pytest.mark.parametrize("scale", [1.0, 4.0, 0.3])
+@pytest.mark.parametrize(
+    "scale", [1.0, pytest.param(4.0, marks=pytest.mark.slow), pytest.param(0.3, marks=pytest.mark.slow)]
+)
 def test_a_force_without_gravity_is_not_called_g(right: SensorLog, scale: float) -> None:
     """Whatever its size: of a hard drive its median is near 1, as of a force in g."""
     assert right.imu is not None
@@ -116,7 +124,9 @@ def test_a_drive_that_is_all_in_reverse_is_one_of_the_reasons(right: SensorLog) 
     assert any("or all of the drive is in reverse" in line for line in said)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in BY_AXES[3:])) for name in CASES]
+)
 def test_a_wrong_convention_is_named_and_its_setting_mends_it(name: str, right: SensorLog) -> None:
     force, rate, says, correction = CASES[name]
     broken = reporting(right, force, rate)
@@ -131,7 +141,14 @@ def test_a_wrong_convention_is_named_and_its_setting_mends_it(name: str, right: 
 
 
 @pytest.mark.parametrize(
-    "angles", [(0.0, 0.0, 40.0), (0.0, 15.0, 0.0), (30.0, 0.0, 0.0), (-12.0, 8.0, -35.0)]
+    "angles",
+    [
+        (-12.0, 8.0, -35.0),
+        *(
+            pytest.param(one, marks=pytest.mark.slow)
+            for one in ((0.0, 0.0, 40.0), (0.0, 15.0, 0.0), (30.0, 0.0, 0.0))
+        ),
+    ],
 )
 def test_a_unit_that_is_mounted_askew_is_found_with_its_angles(
     angles: tuple[float, float, float], right: SensorLog

@@ -79,14 +79,14 @@ def test_heights_that_wander_farther_than_streets_climb_are_told(right: SensorLo
     assert "wander" not in said(1.0, climb)
 
 
-@pytest.mark.parametrize("height", [115.0, 3.0, -20.0])
+@pytest.mark.parametrize("height", [3.0, *(pytest.param(m, marks=pytest.mark.slow) for m in (115.0, -20.0))])
 def test_heights_in_millimetres_are_no_road(right: SensorLog, height: float) -> None:
     lat, lon, alt = FRAME.to_geodetic(fixes_of(right).positions)
     said = wrong(findings(written(right, lat, lon, 1000.0 * (alt - FRAME.alt_m + height))))
     assert any("altitude is in mm" in line for line in said)
 
 
-@pytest.mark.parametrize("late_s", [-1.0, 0.5, 2.0])
+@pytest.mark.parametrize("late_s", [-1.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.5, 2.0))])
 def test_a_late_clock_is_found_and_its_setting_mends_it(right: SensorLog, late_s: float) -> None:
     fixes = fixes_of(right)
     late = replace(right, gnss=GnssFixes(fixes.stamps + late_s, fixes.positions, fixes.stddevs))
@@ -154,7 +154,15 @@ def test_a_frozen_receiver_is_told_from_a_standing_vehicle(
     assert any("frozen" in line for line in said)
 
 
-@pytest.mark.parametrize(("per_degree", "is_coarse"), [(1e5, True), (6e4, True), (6e5, False), (1e8, False)])
+@pytest.mark.parametrize(
+    ("per_degree", "is_coarse"),
+    [
+        (1e5, True),
+        (6e5, False),
+        pytest.param(6e4, True, marks=pytest.mark.slow),
+        pytest.param(1e8, False, marks=pytest.mark.slow),
+    ],
+)
 def test_rounded_degrees_are_not_called_frozen(right: SensorLog, per_degree: float, is_coarse: bool) -> None:
     """Five fixes a second, of which several have the same place at 10 km/h; four or five decimals are told."""
     seen = fixes_of(right)
@@ -180,7 +188,7 @@ def test_a_receiver_that_holds_its_place_while_the_vehicle_stands_is_not_frozen(
     assert not any("frozen" in line for line in wrong(findings(replace(held, imu=still))))
 
 
-@pytest.mark.parametrize("factor", [0.01, 0.001])
+@pytest.mark.parametrize("factor", [0.01, pytest.param(0.001, marks=pytest.mark.slow)])
 def test_standard_deviations_that_nobody_reaches_are_told_of(right: SensorLog, factor: float) -> None:
     fixes = fixes_of(right)
     sure = replace(right, gnss=GnssFixes(fixes.stamps, fixes.positions, fixes.stddevs * factor))
@@ -273,8 +281,9 @@ def test_poses_of_a_camera_look_aside() -> None:
     assert any("other axes" in line for line in wrong(findings(given(T))))
 
 
-@pytest.mark.parametrize("shift_s", [18.0, pytest.param(-18.0, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("seed", [0, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shift_s", [18.0, -18.0])
+@pytest.mark.parametrize("seed", [0, 6])
 def test_gps_time_in_place_of_utc_is_found(seed: int, shift_s: float) -> None:
     log = drive(seed, 120.0, ImuNoise())
     fixes = GnssFixes(fixes_of(log).stamps + shift_s, fixes_of(log).positions, fixes_of(log).stddevs)

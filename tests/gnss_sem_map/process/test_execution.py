@@ -84,6 +84,7 @@ def test_an_argument_that_is_no_json_is_refused(argument: object) -> None:
         task("echo", argument)
 
 
+@pytest.mark.slow
 @integration
 def test_workers_that_are_kept_do_the_next_tasks_too(tmp_path: Path) -> None:
     with closing(processes(2, keep=True)) as kept:
@@ -118,6 +119,7 @@ def test_no_task_is_no_work() -> None:
     assert results([], processes()) == {}
 
 
+@pytest.mark.slow
 @integration
 def test_workers_share_the_cores_and_are_recycled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GNSS_SEM_MAP_THREADS", "6")
@@ -143,6 +145,7 @@ def test_a_task_has_one_thread_of_blas_whatever_the_cores(
         assert set(small_tasks.blas_threads()) == {2}
 
 
+@pytest.mark.slow
 @integration
 def test_fewer_tasks_than_workers_share_all_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GNSS_SEM_MAP_THREADS", "6")
@@ -153,7 +156,7 @@ def test_fewer_tasks_than_workers_share_all_cores(tmp_path: Path, monkeypatch: p
 
 
 @integration
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSEGV, marks=pytest.mark.slow)])
 def test_a_task_whose_worker_dies_is_called_again(number: signal.Signals, tmp_path: Path) -> None:
     tasks = [*products(4), task("dies", str(tmp_path), int(number), 2), *products(4)]
     found = [result for _, result in run_tasks(tasks, processes())]
@@ -178,12 +181,14 @@ def test_the_other_tasks_are_done_when_the_caller_accepts_the_loss(tmp_path: Pat
     assert told[-1] == (13, 13)
 
 
+@pytest.mark.slow
 @integration
 def test_a_worker_that_exits_is_told_with_its_code() -> None:
     with pytest.raises(DataError, match=r" 3 x .*exit code 7; .*__main__"):
         results([task("exits", 7)], processes(1))
 
 
+@pytest.mark.slow
 @integration
 def test_a_worker_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
     (tmp_path / "once").mkdir()
@@ -195,6 +200,7 @@ def test_a_worker_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
         results([task("grows", str(tmp_path / "ever"), 9, 20_000_000)], processes(memory_bytes=limit))
 
 
+@pytest.mark.slow
 @integration
 def test_a_task_that_is_refused_memory_is_called_again(tmp_path: Path) -> None:
     assert results([task("has_no_memory", str(tmp_path), 2)], processes()) != {}
@@ -202,6 +208,7 @@ def test_a_task_that_is_refused_memory_is_called_again(tmp_path: Path) -> None:
         results([task("has_no_memory", str(tmp_path), 9)], processes())
 
 
+@pytest.mark.slow
 @integration
 def test_a_task_that_takes_too_long_is_called_again(tmp_path: Path) -> None:
     (tmp_path / "once").mkdir()
@@ -235,7 +242,7 @@ def test_a_script_without_a_guard_gets_an_error_and_does_not_hang(tmp_path: Path
     script = tmp_path / "script.py"
     script.write_text(PARENT.replace('if __name__ == "__main__":', "if True:"))
     words = [sys.executable, str(script), str(TESTS), str(tmp_path)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=100)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=600)
     assert "if __name__ == '__main__'" in done.stderr.splitlines()[-1]
 
 
@@ -264,7 +271,10 @@ if __name__ == "__main__":
 
 
 @integration
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, *(pytest.param(s, marks=pytest.mark.slow) for s in (signal.SIGTERM, signal.SIGINT))],
+)
 def test_workers_end_when_their_parent_does(number: signal.Signals, tmp_path: Path) -> None:
     script, begun = tmp_path / "script.py", tmp_path / "begun"
     script.write_text(PARENT)
@@ -274,7 +284,7 @@ def test_workers_end_when_their_parent_does(number: signal.Signals, tmp_path: Pa
         try:
             assert wait_until(lambda: len(list(begun.iterdir())) == 2)
             process.send_signal(number)
-            process.wait(20)
+            process.wait(600)
         finally:
             process.kill()
     workers = [int(path.name) for path in begun.iterdir()]
@@ -294,7 +304,7 @@ def test_no_worker_is_ended_by_ctrl_c_which_its_parent_handles(tmp_path: Path) -
             for worker in workers:
                 os.kill(int(worker), signal.SIGINT)
             (begun / "go").touch()
-            assert process.communicate(timeout=60)[1] == ""
+            assert process.communicate(timeout=600)[1] == ""
         finally:
             process.kill()
     assert {path.stem for path in begun.glob("*.ended")} == workers

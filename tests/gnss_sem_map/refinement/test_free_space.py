@@ -79,6 +79,17 @@ def test_what_was_hit_often_stays_whoever_looks_through() -> None:
     assert not cleared(voxels).any()
 
 
+@pytest.mark.parametrize(("hit_by", "goes"), [(2, True), (10, False)])
+def test_what_more_scans_hit_than_see_through_stays(hit_by: int, goes: bool) -> None:
+    voxels = street_map(GHOST)
+    seen = [np.concatenate([ground_and_facades(x), GHOST[: 51 * (k < hit_by)]]) for k, x in enumerate(STREET)]
+    witnesses = KeyframeScans.of(
+        [RangeImage.of(points, pose(x), DENSE) for points, x in zip(seen, STREET, strict=True)]
+    )
+    empty = traversed(voxels, witnesses, FreeSpaceSettings())
+    np.testing.assert_array_equal(empty, np.isin(voxels.keys, keys_of(GHOST, 0.2)) & goes)
+
+
 def test_too_few_witnesses_clear_nothing_and_nothing_low_is_cleared(monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = street_map(GHOST)
     assert not cleared(voxels, FreeSpaceSettings(least_misses=len(STREET) + 1)).any()

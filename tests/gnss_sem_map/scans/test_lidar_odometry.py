@@ -283,7 +283,9 @@ def half_of(log: SensorLog, which: int) -> SensorLog:
     return replace(log, scans=tuple(replace(s, read=partial(read, s)) for s in log.scans))
 
 
-@pytest.mark.parametrize("section_scans", [5, 8, 16])
+@pytest.mark.parametrize(
+    "section_scans", [pytest.param(5, marks=pytest.mark.slow), 8, pytest.param(16, marks=pytest.mark.slow)]
+)
 def test_sections_bind_every_sweep_as_closely_as_the_whole_drive(
     section_scans: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -45,7 +45,9 @@ def expected_probabilities(net: Any, shrink: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shrink", [1, 2, 4])
-@pytest.mark.parametrize("wrap", [None, "state_dict", "model"])
+@pytest.mark.parametrize(
+    "wrap", [None, *(pytest.param(name, marks=pytest.mark.slow) for name in ("state_dict", "model"))]
+)
 def test_a_torch_checkpoint_gives_the_saved_networks_probabilities(
     tmp_path: Path, shrink: int, wrap: str | None
 ) -> None:

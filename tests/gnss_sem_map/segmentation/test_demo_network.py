@@ -55,6 +55,7 @@ def test_its_calibration_is_of_other_streets_than_the_demos_and_trusts_its_answe
     assert found.log_likelihoods[:5].argmax(axis=1).tolist() == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.slow
 def test_the_trainer_that_made_it_learns_from_simulated_streets(
     streets: list[tuple[np.ndarray, np.ndarray]], tmp_path: Path
 ) -> None:

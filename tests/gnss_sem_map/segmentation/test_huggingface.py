@@ -94,7 +94,9 @@ def test_any_image_size_gives_probabilities_at_half_of_it(tmp_path: Path, build:
 
 
 @pytest.mark.parametrize("build", FAMILIES)
-@pytest.mark.parametrize("shape", [(45, 173), (173, 45), (70, 70)])
+@pytest.mark.parametrize(
+    "shape", [(45, 173), *(pytest.param(shape, marks=pytest.mark.slow) for shape in ((173, 45), (70, 70)))]
+)
 def test_every_family_gives_probabilities_of_images_of_any_shape(
     tmp_path: Path, build: Any, shape: tuple[int, int]
 ) -> None:

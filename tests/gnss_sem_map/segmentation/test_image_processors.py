@@ -82,6 +82,7 @@ def test_every_family_sees_what_its_own_image_processor_makes_of_an_image_of_its
         np.testing.assert_array_equal(prepared(tmp_path, PIXELS), wanted.float())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", FAMILIES)
 def test_without_a_file_the_image_processor_of_the_kind_is_used(tmp_path: Path, build: Any) -> None:
     theirs = processor_of(saved(tmp_path, build()).config)()

@@ -114,7 +114,14 @@ SMALL = [
 
 
 @pytest.mark.parametrize(("build", "backbone", "layout"), SMALL)
-@pytest.mark.parametrize("size", [(64, 96), (47, 61), (33, 130)])
+@pytest.mark.parametrize(
+    "size",
+    [
+        (47, 61),
+        pytest.param((64, 96), marks=pytest.mark.slow),
+        pytest.param((33, 130), marks=pytest.mark.slow),
+    ],
+)
 def test_logits_come_at_a_quarter_of_any_image_size(
     build: Any, backbone: str, layout: dict[str, Any], size: tuple[int, int]
 ) -> None:
@@ -137,6 +144,7 @@ def test_an_image_gets_the_same_logits_alone_and_in_company(
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4 * float(together.abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("build", "backbone", "layout"), SMALL)
 def test_every_parameter_that_the_logits_depend_on_gets_a_gradient(
     build: Any, backbone: str, layout: dict[str, Any]
@@ -157,6 +165,7 @@ def test_moving_the_image_by_a_stride_moves_the_logits() -> None:
     torch.testing.assert_close(second[..., middle], first[..., middle + 8], rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_network_that_is_told_its_classes_learns_one_picture() -> None:
     network = LightWeightRefineNet(3, "mobilenet_v2", width=24, depth_head=False).train()
     images = torch.zeros(2, 3, 64, 96)

@@ -104,6 +104,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others(streets: A
     assert not torch.equal(first["segm.weight"], other["segm.weight"])
 
 
+@pytest.mark.slow
 def test_half_precision_gives_other_weights_but_the_same_for_the_same_seed(
     streets: Any, tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_once import made_once
 
 from gnss_sem_map.simulation import Camera, Lidar, Simulation, prepare, simulate
 
@@ -19,8 +20,11 @@ def small_lidar(range_stddev_m: float) -> Lidar:
 @pytest.fixture(scope="session")
 def town_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A drive on disk."""
-    folder = tmp_path_factory.mktemp("town")
-    return simulate(folder, SECONDS, SEED, lidar=small_lidar(0.02), camera=CAMERA, workers=2)
+
+    def make(folder: Path) -> Path:
+        return simulate(folder, SECONDS, SEED, lidar=small_lidar(0.02), camera=CAMERA, workers=2)
+
+    return made_once(tmp_path_factory, "town", make)
 
 
 @pytest.fixture(scope="session")

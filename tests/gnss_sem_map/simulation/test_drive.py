@@ -178,6 +178,7 @@ def test_tracklets_are_the_boxes_of_what_the_camera_sees(town_drive: Path, simul
     assert 5 < expected[0] < 25
 
 
+@pytest.mark.slow
 def test_threads_and_repeats_do_not_change_a_byte(
     town_drive: Path, simulation: Simulation, tmp_path: Path
 ) -> None:

@@ -63,6 +63,7 @@ def test_a_layout_reads_as_the_drive_itself(
     assert other.skips == ()
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_the_map_is_the_same_in_every_layout(
     small_drive: street.Street, layouts: dict[str, Path], tmp_path: Path

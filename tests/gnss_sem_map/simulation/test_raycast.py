@@ -158,6 +158,7 @@ def test_the_ground_is_met_once_and_at_its_height(
     assert clear.min() > -1e-6
 
 
+@pytest.mark.slow
 def test_the_grid_forgets_nothing(whole_drive: Simulation) -> None:
     world = whole_drive.world
     scene = world.scene(12.0, 12.1)
@@ -199,7 +200,7 @@ def map_points(simulation: Simulation, frame: int) -> tuple[Floats, npt.NDArray[
     return np.einsum("nij,nj->ni", T[:, :3, :3], p) + T[:, :3, 3], scan.labels
 
 
-@pytest.mark.parametrize("frame", [20, 80, 165, 240])
+@pytest.mark.parametrize("frame", [20, *(pytest.param(n, marks=pytest.mark.slow) for n in (80, 165, 240))])
 def test_points_at_their_own_stamps_lie_on_ground_and_vehicles(whole_drive: Simulation, frame: int) -> None:
     points, labels = map_points(whole_drive, frame)
     ground, raw, instances = whole_drive.world.town.ground, labels & 0xFFFF, labels >> 16
@@ -220,7 +221,9 @@ def test_points_at_their_own_stamps_lie_on_ground_and_vehicles(whole_drive: Simu
     assert seen > 40
 
 
-@pytest.mark.parametrize("frame", [30, 140, 200])
+@pytest.mark.parametrize(
+    "frame", [30, pytest.param(140, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.slow)]
+)
 def test_points_on_movers_lie_where_these_are_at_the_ray_s_own_time(
     whole_drive: Simulation, frame: int
 ) -> None:

@@ -167,8 +167,8 @@ def test_truth_is_by_sensor_and_corrupted_labels_are_a_segmenter_s(
     assert not np.array_equal(first, second)
 
 
-@pytest.mark.parametrize("layout", ["rosbag1", "mcap"])
-@pytest.mark.parametrize("name", ["surround", "kitti-360"])
+@pytest.mark.parametrize("layout", [pytest.param("rosbag1", marks=pytest.mark.slow), "mcap"])
+@pytest.mark.parametrize("name", ["surround", pytest.param("kitti-360", marks=pytest.mark.slow)])
 def test_a_bag_of_a_rig_reads_as_its_table(name: RigName, layout: Layout, tmp_path: Path) -> None:
     simulation = prepare(0.3, SEED, rig=coarse(name))
     table = open_drive(write_table(simulation, tmp_path / "table", workers=2))
@@ -214,6 +214,7 @@ def test_a_rig_is_not_written_over_another_nor_as_kitti_raw(table: Path, surroun
     assert [path.name for path in table.parent.iterdir()] == [table.name]
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_a_byte(table: Path, surround: Simulation, tmp_path: Path) -> None:
     again = write_table(surround, tmp_path, workers=1)
     files = sorted(path.relative_to(table) for path in table.rglob("*") if path.is_file())

@@ -37,6 +37,7 @@ def test_the_unit_is_an_hdl_64e() -> None:
     assert np.abs(lidar.azimuths).max() < np.pi
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_same_seed_gives_the_same_bytes_with_any_number_of_threads(
     seed: int, simulation: Simulation

@@ -23,7 +23,7 @@ FRAME = LocalFrame(49.0, 8.4, 115.0)
 LANE_M = 3.3
 
 
-@pytest.fixture(scope="module", params=[0, 1])
+@pytest.fixture(scope="module", params=[0, pytest.param(1, marks=pytest.mark.slow)])
 def days(request: pytest.FixtureRequest) -> list[Simulation]:
     """Sessions 0 and 1 of a seed."""
     return [prepare(6.0, request.param, session=session) for session in (0, 1)]
@@ -50,7 +50,9 @@ def things_inside(town: Town, scene: Scene, change: Change) -> list[str]:
     return names
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_a_lap_returns_to_the_same_lane(seed: int) -> None:
     drive = prepare(None, seed, laps=2)
     ego, length = drive.world.ego, lap_length(drive.world.town)
@@ -87,6 +89,7 @@ def test_positions_are_as_wrong_as_they_claim(gnss: Gnss, claimed: float, stddev
     assert np.std(errors, axis=(0, 1)) == pytest.approx(stddevs, rel=0.1)
 
 
+@pytest.mark.slow
 def test_what_the_truth_says_is_there_on_its_day_and_not_on_the_other_one(days: list[Simulation]) -> None:
     scenes = [still(day) for day in days]
     near = [

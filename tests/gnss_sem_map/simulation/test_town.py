@@ -9,7 +9,7 @@ from gnss_sem_map.simulation.ground import inside_block
 from gnss_sem_map.simulation.surfaces import Surface
 
 Floats = npt.NDArray[np.float64]
-SEEDS = [0, 1, 2, 3]
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))]
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -146,6 +146,7 @@ def test_nobody_runs_into_anybody(drive: Simulation) -> None:
             assert np.linalg.norm(mine - other, axis=1).min() > 0.9 * (radius + reach)
 
 
+@pytest.mark.slow
 def test_movers_follow_the_same_streets_when_the_drive_is_longer() -> None:
     short, long = prepare(3.0, 0), prepare(60.0, 0)
     stamps = np.arange(0.0, 3.0, 0.1)

@@ -181,7 +181,7 @@ def _label_files(
             files |= {(camera, number): path for number, path in numbered.items()}
             told = told or kind
     if all(found.values()):
-        raise DataError(f"labels {shown(folder)}: found .npz and .png; keep them in two folders")
+        raise DataError(f"labels {shown(folder)}: found both .npz and .png; keep one kind")
     for suffix, files in found.items():
         if files:
             return files, suffix, told

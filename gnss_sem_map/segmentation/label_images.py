@@ -59,7 +59,7 @@ class Meaning:
             found = [f"#{v:06x}" for v in unknown[:5]] if self.kind == COLOUR else f"ids {unknown[:20]}"
             raise refused(
                 path,
-                f"found {found}, no {self.kind} of {self.source.name}; say what they are (ids, taxonomy)",
+                f"found {found}, which are no {self.kind} of {self.source.name} (?ids=, ?taxonomy=)",
             )
         return seen
 

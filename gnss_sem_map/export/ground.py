@@ -4,8 +4,9 @@ known. It is the ground that the refinement uses (see `refinement.surroundings`)
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -62,13 +63,6 @@ class Ground:
     """(v,) height of the points of each over the ground under them."""
 
 
-def windows(low: NDArray[np.int64], high: NDArray[np.int64], step: int) -> Iterator[tuple[int, int]]:
-    """The lowest corners, in columns, of windows from `low` to `high` (2,): from north to south, and west to east."""
-    first, last = (low // step).tolist(), (high // step).tolist()
-    for y in range(last[1], first[1] - 1, -1):
-        yield from ((x * step, y * step) for x in range(first[0], last[0] + 1))
-
-
 def ground_of(exported: Exported, low: tuple[int, int], shape: tuple[int, int]) -> Ground:
     """The ground of `shape` columns from `low` on.
 
@@ -111,9 +105,10 @@ def ground_of(exported: Exported, low: tuple[int, int], shape: tuple[int, int]) 
 
 
 def _around(
-    low: Corner, shape: tuple[int, int], margin: int, block: int
+    low: Iterable[int], shape: Iterable[int], margin: int, block: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last but one column of whole blocks that hold a window and a margin around it."""
+    low = list(low)
     first = [(start - margin) // block * block for start in low]
     end = [-(-(start + length + margin) // block) * block for start, length in zip(low, shape, strict=True)]
     return np.array(first), np.array(end)
@@ -122,7 +117,9 @@ def _around(
 def _standing(tiled_map: TiledMap, first: NDArray[np.int64], end: NDArray[np.int64]) -> SemanticMap:
     """The voxels that were not removed, of columns from `first` to before `end` and as far around as ground is told."""
     size = tiled_map.voxel_size_m
-    first, end = _around(first, end - first, math.ceil(REACH_M / size) + BLOCK * AROUND, BLOCK)
+    first, end = _around(
+        first.tolist(), (end - first).tolist(), math.ceil(REACH_M / size) + BLOCK * AROUND, BLOCK
+    )
     part = tiled_map.inside(((*(first * size), -np.inf), (*(end * size), np.inf)))
     return part[np.flatnonzero(part.states != State.REMOVED)]
 
@@ -147,9 +144,8 @@ def _told_apart(
     is_ground = (~over | np.isin(standing.labels, ways)) & (np.abs(heights) < OVER_M)
     is_ground &= ~is_ghost & ~np.isin(standing.labels, label_set.having(*STANDING))
     known = is_ground & is_way if exported.extent.labels[ways].any() else is_ground
-    highest = _followed(
-        *(_lowest(x, y, shape, surfaces, each) for each in (known, is_ground)), exported.map.voxel_size_m
-    )
+    lowest = [_lowest(x, y, shape, surfaces, each) for each in (known, is_ground)]
+    highest = _followed(lowest[0], lowest[1], exported.map.voxel_size_m)
     is_ground &= surfaces < highest[x, y] + STEP_M
     return is_ghost, over & ~is_ground, is_ground
 
@@ -184,8 +180,10 @@ def _filled(values: Heights, weights: Heights, levels: int) -> tuple[Heights, He
     coarse, known = _filled(_ratio(pulled), np.ascontiguousarray(pulled[..., 1]), levels - 1)
     pushed = cv2.resize(np.dstack([coarse * known, known]), (wide, high), interpolation=cv2.INTER_LINEAR)
     is_known = weights > 0
-    return np.where(is_known, values, _ratio(pushed)), np.where(is_known, weights, pushed[..., 1])
+    return np.where(is_known, values, _ratio(pushed)), np.where(
+        is_known, weights, np.asarray(pushed[..., 1], np.float32)
+    )
 
 
-def _ratio(weighted: Heights) -> Heights:
-    return weighted[..., 0] / np.maximum(weighted[..., 1], np.float32(1e-20))
+def _ratio(weighted: NDArray[Any]) -> Heights:
+    return np.asarray(weighted[..., 0] / np.maximum(weighted[..., 1], np.float32(1e-20)), np.float32)

@@ -113,7 +113,7 @@ def _costs(
     driven = _driven(exported, (low[0] * per_cell, low[1] * per_cell), costs.shape)
     costs = np.where(driven & (costs == OCCUPIED), PASSED, costs)
     in_cells = costs.reshape(shape[0], per_cell, shape[1], per_cell)
-    return in_cells.max(axis=(1, 3)).astype(np.uint8)  # -1, which is unknown, becomes 255
+    return np.asarray(in_cells.max(axis=(1, 3)).astype(np.uint8))  # -1, which is unknown, becomes 255
 
 
 def _driven(exported: Exported, low: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -125,7 +125,7 @@ def _driven(exported: Exported, low: tuple[int, int], shape: tuple[int, ...]) ->
         near = ((columns >= -wide) & (columns < np.array(shape) + wide)).all(axis=1)
         for i in np.flatnonzero(near[1:] & near[:-1]).tolist():
             cv2.line(found, columns[i, ::-1].tolist(), columns[i + 1, ::-1].tolist(), 1, wide)
-    return found > 0
+    return np.asarray(found > 0, np.bool_)
 
 
 def _of_columns(
@@ -152,8 +152,8 @@ def _of_columns(
     is_body = ground.over & np.isin(labels, label_set.having(*ON_GROUND)) & (ground.above > settings.step_m)
     bodies[ground.columns[is_body]] = 1
     around = np.ones((2 * hollow + 1, 2 * hollow + 1), np.uint8)
-    bodies = cv2.morphologyEx(bodies.reshape(ground.seen.shape), cv2.MORPH_CLOSE, around)
-    costs[bodies.ravel() > 0] = OCCUPIED
+    closed = cv2.morphologyEx(bodies.reshape(ground.seen.shape), cv2.MORPH_CLOSE, around)
+    costs[closed.ravel() > 0] = OCCUPIED
     return costs.reshape(ground.seen.shape)
 
 

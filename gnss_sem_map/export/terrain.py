@@ -40,15 +40,16 @@ def write_terrain(exported: Exported, folder: Path) -> None:
     georeference = exported.georeference_for("a terrain model")
     cells = Cells.of(exported.extent, GEOTIFF_LONGEST_SIDE)
     grid = Grid.over(cells, exported, georeference)
-    profile = {"dtype": "float32", "count": len(BANDS), "nodata": NODATA, "predictor": 3}
+    profile = {"dtype": "float32", "count": len(BANDS), "nodata": NODATA, "predictor": 3, "zlevel": 1}
     with (
         adding_folder(folder) as inside,
         new_cog(inside / "dtm.tif", grid, georeference, "average", **profile) as dtm,
         new_cog(inside / "dsm.tif", grid, georeference, "average", **profile) as dsm,
     ):
         for corner, (ground, surface) in _blocks(exported, cells, grid, georeference):
-            dtm.write(ground, window=window_of(corner, ground.shape[1:]))
-            dsm.write(surface, window=window_of(corner, surface.shape[1:]))
+            if (ground[0] != NODATA).any() or (surface[0] != NODATA).any():  # what is not written is no data
+                dtm.write(ground, window=window_of(corner, ground.shape[1:]))
+                dsm.write(surface, window=window_of(corner, surface.shape[1:]))
         for tiff, what in zip((dtm, dsm), MODELS.values(), strict=True):
             tiff.descriptions = BANDS
             tiff.update_tags(what=what, heights=georeference.words)
@@ -73,7 +74,7 @@ def _blocks(
             corner, shape = corners.block(i + k, j + m)
             places = between(part[k : k + 2, m : m + 2] - first - 0.5, shape).astype(np.float32)
             lift_m = between(corners.lift_m[i + k : i + k + 2, j + m : j + m + 2, None], shape)[..., 0]
-            yield corner, tuple(_sampled(each, places, lift_m) for each in bands)
+            yield corner, (_sampled(bands[0], places, lift_m), _sampled(bands[1], places, lift_m))
 
 
 def _bands(
@@ -84,8 +85,11 @@ def _bands(
     is_ground = ground.seen & (np.abs(ground.tops - ground.heights) < size / 2)
     tops = np.where(is_ground, ground.heights, ground.tops)
     stddevs = np.where(is_ground, ground.stddevs, np.float32(size / np.sqrt(12)))
-    both = (ground.heights, ground.stddevs), (tops, stddevs)
-    return tuple([np.ascontiguousarray(band.T[::-1]) for band in bands] for bands in both)
+    both = [
+        [np.ascontiguousarray(band.T[::-1], np.float32) for band in bands]
+        for bands in ((ground.heights, ground.stddevs), (tops, stddevs))
+    ]
+    return both[0], both[1]
 
 
 def _sampled(bands: list[Heights], places: Heights, lift_m: NDArray[np.float64]) -> Heights:

@@ -122,7 +122,7 @@ def _driven(exported: Exported, low: tuple[int, int], shape: tuple[int, ...]) ->
     wide = 2 * round(DRIVEN_M / size) + 1
     for track in exported.tracks:
         columns = np.floor(track.positions[:, :2] / size).astype(np.int64) - low
-        near = ((columns >= -wide) & (columns < np.array(shape) + wide)).all(axis=1)
+        near = np.all((columns >= -wide) & (columns < np.array(shape) + wide), axis=1)
         for i in np.flatnonzero(near[1:] & near[:-1]).tolist():
             cv2.line(found, columns[i, ::-1].tolist(), columns[i + 1, ::-1].tolist(), 1, wide)
     return np.asarray(found > 0, np.bool_)

@@ -167,11 +167,7 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
     where = where_seen(problem, fit, motion)
     seen, skids = motion[where], np.zeros((len(where), 2))
-    if doubt := too_seldom(
-        f"it is seen to move faster than {MOVING_SPEED:g} m/s",
-        np.linalg.norm(seen.velocity, axis=1),
-        seen.spacing,
-    ):
+    if doubt := too_seldom("it is seen to move", np.linalg.norm(seen.velocity, axis=1), seen.spacing):
         return Vehicle(np.zeros(5), (UNSEEN, UNSEEN), skids, doubt)
     mounting, by_mounting, slip = np.zeros(5), seen.by_mounting(), []
     for row, part in enumerate((SIDEWAYS, UPWARDS)):

@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import C
 
 from factor_graphs.arrays import Array
 from factor_graphs.chi_square import BEYOND_DOUBT, probability_below, quantile
-from factor_graphs.elimination import by_sections, eliminate, factor_of, shared_keys, split
+from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
 from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.problem import Fit, Problem
 
@@ -227,10 +227,16 @@ def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianF
             columns = np.zeros((len(b), size))
             columns[:, -1] = (A[:, axis - 9] + A[:, axis - 3]) * rates[n]
             terms = [(key, A[:, i:j]) for key, (i, j) in zip(row.keys(), pairwise(OF_IMU), strict=True)]
-            row = factor_of([*terms, (C(0), columns)], b)
+            row = _joined(terms, columns, b)
         elif first_fix <= n < first_fix + len(problem.at):
             A, b = row.jacobian()
             columns = np.zeros((3, size))
             columns[:, stretch[n - first_fix]], columns[:, -4:-1] = A[:, 3:] @ moving[n - first_fix], A[:, 3:]
-            row = factor_of([(row.keys()[0], A), (C(0), columns)], b)
+            row = _joined([(row.keys()[0], A)], columns, b)
         yield row
+
+
+def _joined(terms: list[tuple[int, Array]], columns: Array, b: Array) -> gtsam.JacobianFactor:
+    """A factor of many keys: of GTSAM's constructors, only that of a conditional takes a list from Python."""
+    unit = gtsam.noiseModel.Unit.Create(len(b))
+    return gtsam.JacobianFactor(gtsam.GaussianConditional([*terms, (C(0), columns)], 1, b, unit))

@@ -133,11 +133,6 @@ def state_keys(i: int) -> Group:
     return X(i), V(i), B(i)
 
 
-def factor_of(terms: list[tuple[int, Array]], b: Array) -> gtsam.JacobianFactor:
-    """The factor of many keys with their columns: of GTSAM's constructors, only that of a conditional takes a list."""
-    return gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, b, gtsam.noiseModel.Unit.Create(len(b))))
-
-
 def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
     """These keys, in this order."""
     ordering = gtsam.Ordering()

@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
-from factor_graphs.chi_square import NEVER_ZERO, quantile
+from factor_graphs.chi_square import quantile
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 # Ellipsoids in which errors are counted hold these shares of them when covariances are true.
 SHARES = (0.5, 0.9, 0.95)
@@ -96,7 +97,7 @@ def relative_error(estimate: Trajectory, reference: Trajectory, step: int = 1) -
     off = np.linalg.inv(moved[1]) @ moved[0]
     distance = np.linalg.norm(moved[1][:, :3, 3], axis=1)
     angle = np.atleast_1d(Rotation.from_matrix(off[:, :3, :3]).magnitude())
-    share = np.sqrt(np.sum(off[:, :3, 3] ** 2) / max(float(np.sum(distance**2)), NEVER_ZERO))
+    share = np.sqrt(np.sum(off[:, :3, 3] ** 2) / max(float(np.sum(distance**2)), 1e-12))
     return RelativeError(_rms(off[:, :3, 3]), float(np.degrees(_rms(angle[:, None]))), float(share))
 
 

@@ -8,16 +8,17 @@ lines between fixes the optimiser stays in a wrong valley after a long outage.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array, Complex
 from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
-from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.intervals import ImuIntervals, nearest
 from factor_graphs.measurements import GnssFixes
+
+Array = NDArray[np.float64]
 
 # Prior of the first keyframe's position m and speed m/s: finite, and no information.
 START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
@@ -25,6 +26,8 @@ START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
 CRUISE_NOISE_DENSITY = 1.5
 # Course says nothing about heading below this speed, m/s, nor this far, s, from a fix.
 MIN_COURSE_SPEED, MAX_COURSE_AGE = 1.5, 1.5
+# The gyroscope's heading is tied to the course over this long, s.
+HEADING_WINDOW_S = 20.0
 # So far from the axis of the vehicle, rad, the imu looks aside.
 LOOKING_ASIDE = np.pi / 4
 # Over this long, s, a vehicle goes more forward than backward.
@@ -135,7 +138,7 @@ def attitudes(
         weight[0] = 1 / attitude.heading_stddev
         ahead[0] = np.exp(1j * np.arctan2(attitude.R_map_imu[1, 0], attitude.R_map_imu[0, 0]))
     # the course is along the axis of the vehicle, whether it goes forward or reverses
-    axis = _smooth(intervals.keyframes, ahead**2, weight, HEADING_HOLDS_S)
+    axis = _smooth(intervals.keyframes, ahead**2, weight, HEADING_WINDOW_S)
     axis = np.exp(0.5j * np.unwrap(np.angle(axis)))
     off = None if attitude else _off_axis(intervals, level, turned + np.angle(axis), velocities)
     if off is not None:
@@ -175,7 +178,9 @@ def _without_heading(R: Array) -> Array:
     return Rotation.from_euler("z", -np.arctan2(R[1, 0], R[0, 0])).as_matrix() @ R
 
 
-def _smooth(stamps: Array, directions: Complex, weights: Array, window_s: float) -> Complex:
+def _smooth(
+    stamps: Array, directions: NDArray[np.complex128], weights: Array, window_s: float
+) -> NDArray[np.complex128]:
     """Weighted mean of unit numbers over a Gaussian window; the nearest known where the window is empty."""
     if not weights.any():
         return np.ones(len(stamps), dtype=complex)
@@ -186,5 +191,5 @@ def _smooth(stamps: Array, directions: Complex, weights: Array, window_s: float)
     total = gaussian_filter1d(total, window_s / step, axis=1, mode="constant", truncate=4.0)
     known = np.flatnonzero(total[0] > 1e-3 * total[0].max())
     used = known[nearest(known, np.arange(total.shape[1]))]
-    smoothed: Complex = (total[1] + 1j * total[2])[used][cell]
+    smoothed: NDArray[np.complex128] = (total[1] + 1j * total[2])[used][cell]
     return smoothed

@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from factor_graphs.arrays import Array
-from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
 from factor_graphs.imu_noise import STANDARD_GRAVITY
 from factor_graphs.measurements import ImuSamples
+
+Array = NDArray[np.float64]
 
 # Clusters up to this share of the record: ten of them; so many times per decade, and from so many samples on, as
 # filters of the unit shape what is shorter.
@@ -22,8 +23,8 @@ LONGEST_SHARE, PER_DECADE, FEWEST_SAMPLES = 0.1, 8, 10
 # The smallest of a flicker is so much of its bias instability.
 FLICKER = 2 * np.log(2) / np.pi
 # A part of the curve is reached where it is most of the variance in so many places, and the curve is off by no more
-# than this share and its standard deviations explain.
-MOST, FEWEST_PLACES, OFF = 0.5, 3, 0.2
+# than this share and so many standard deviations.
+MOST, FEWEST_PLACES, OFF, BEYOND = 0.5, 3, 0.2, 4.0
 # What scatters by less than this share of the step between its values is not resolved.
 RESOLVED = 0.5
 # How long a record would have to be is looked for up to so many times what there is.
@@ -142,7 +143,7 @@ def _reached(
 ) -> tuple[Array, tuple[str, ...]]:
     """The numbers whose part of the curve was reached, NaN for others, and why those are not."""
     shares, total = _shares(squares, taus)
-    fits = np.abs(deviations**2 / total - 1) < OFF + BEYOND_DOUBT * spread
+    fits = np.abs(deviations**2 / total - 1) < OFF + BEYOND * spread
     numbers, why = np.sqrt(squares), ["", "", ""]
     numbers[1] = np.sqrt(total.min() / FLICKER)
     if ((shares[:, 0] > MOST) & fits).sum() < FEWEST_PLACES:

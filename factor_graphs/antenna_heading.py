@@ -10,22 +10,26 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from factor_graphs.arrays import Array
-from factor_graphs.chi_square import BEYOND_DOUBT, huber_weights
+from factor_graphs.chi_square import BEYOND_DOUBT
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.heading import stddevs_of_heading
-from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import AntennaHeadings
-from factor_graphs.model import skew
+from factor_graphs.model import from_values
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.side_measurements import FEWEST_SEEN, Observed, Placed, noise_scale, placed
+from factor_graphs.side_measurements import FEWEST_SEEN, HUBER, Observed, Placed, noise_scale, placed
+
+Array = NDArray[np.float64]
 
 # A solution whose heading is known better than this, rad, judges that of the antennas.
 SURE_HEADING = 0.1
 # An offset is one beyond doubt of the heading of the solution, and beyond this, rad: the place of an
 # antenna 1 m away is known to 1 cm.
 LEAST_OFFSET = 0.01
+# The heading of a solution is wrong by about the same for so long, s.
+SLOW_S = 20.0
 # A heading that scatters by more, rad, is of something else: one that scatters by three times less when it is mirrored,
 # or in another unit, is that.
 SCATTERED, MIRRORED = 0.3, 3.0
@@ -35,7 +39,9 @@ def observe_headings(headings: AntennaHeadings, problem: Problem, fit: Fit) -> O
     """What a solution by the fixes shows of headings, their stamps on the clock of the IMU."""
     place = placed(problem, headings.stamps)
     kept = headings[place.rows]
-    own = stddevs_of_heading(fit.states[0][:, :3, :3], fit.covariances)[place.at]
+    T = from_values(fit.values, len(problem.intervals.keyframes))[0]
+    covariances, _ = keyframe_covariances(fit.graph, fit.values, len(T))
+    own = stddevs_of_heading(T[:, :3, :3], covariances)[place.at]
     off = wrapped(kept.azimuths - _azimuths(problem, fit, place, kept.baseline))
     sure = own < (0.0 if problem.heading_in_doubt else SURE_HEADING)
     said = f"antenna heading: {len(kept)} of {len(headings)} used"
@@ -66,7 +72,7 @@ def _centre(angles: Array) -> float:
 
 def _quick(stamps: Array, off: Array) -> Array:
     """What changes quickly of angles (n,) rad: the solution's own error, by the gyroscope, does not."""
-    size = max(1, round(HEADING_HOLDS_S / float(np.median(np.diff(stamps)))))
+    size = max(1, round(SLOW_S / float(np.median(np.diff(stamps)))))
     return np.asarray(off - uniform_filter1d(off, size, mode="nearest"))
 
 
@@ -95,7 +101,7 @@ def _mistake(headings: AntennaHeadings, off: Array, own: Array) -> str:
 
 def _azimuths(problem: Problem, fit: Fit, place: Placed, baseline: Array) -> Array:
     """Azimuth (r,) rad of the baseline that a solution says."""
-    T = fit.states[0][place.at, :3, :3]
+    T = from_values(fit.values, len(problem.intervals.keyframes))[0][place.at, :3, :3]
     rates = np.einsum("kij,kj->ki", T, problem.intervals.rates[place.at])
     direction = T @ baseline
     return np.asarray(np.arctan2(direction[:, 0], direction[:, 1]) - rates[:, 2] * place.late)
@@ -108,13 +114,14 @@ def _factors(
 
     With u = R b, azimuth a = atan2(u_e, u_n) and R perturbed on the right, d u = -R [b]x d theta.
     """
-    R = fit.states[0][place.at, :3, :3]
-    u, by_turn = R @ headings.baseline, -R @ skew(headings.baseline)
+    R = from_values(fit.values, len(problem.intervals.keyframes))[0][place.at, :3, :3]
+    u, (x, y, z) = R @ headings.baseline, headings.baseline
+    by_turn = -R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     level = np.sum(u[:, :2] ** 2, axis=1)
     rows = np.zeros((len(u), 1, 6))
     rows[:, 0, :3] = (u[:, 1, None] * by_turn[:, 0] - u[:, 0, None] * by_turn[:, 1]) / level[:, None]
     off = wrapped(headings.azimuths - _azimuths(problem, fit, place, headings.baseline)) / headings.stddevs
-    weights = np.sqrt(huber_weights(off**2, 1))
+    weights = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-9)))
     rows *= (weights / headings.stddevs)[:, None, None]
     unit = gtsam.noiseModel.Unit.Create(1)
     return [

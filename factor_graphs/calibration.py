@@ -14,12 +14,14 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import C
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array
 from factor_graphs.chi_square import BEYOND_DOUBT, probability_below, quantile
 from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
-from factor_graphs.imu_noise import HEADING_HOLDS_S
+from factor_graphs.model import motion_from
 from factor_graphs.problem import Fit, Problem
+
+Array = NDArray[np.float64]
 
 # What may be wrong before anything is estimated: clock s, antenna m, scale of the gyroscope.
 CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03
@@ -27,7 +29,7 @@ DOUBT = 1 - probability_below(BEYOND_DOUBT**2, 1)
 # A scale is in question where fixes and IMU alone show more than those of half of all good gyroscopes.
 QUESTIONABLE = 0.5
 # The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
-STRETCHES, SHORTEST_S, PLACED_S = 8, HEADING_HOLDS_S, 1.0
+STRETCHES, SHORTEST_S, PLACED_S = 8, 20.0, 1.0
 # Columns of an IMU factor: pose, velocity, pose, velocity, biases, biases.
 OF_IMU = np.cumsum([0, 6, 3, 6, 3, 6, 6])
 
@@ -214,7 +216,7 @@ def scale_error(problem: Problem, fit: Fit) -> float:
 def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianFactor]:
     """The linear graph, with columns of lasting errors beside those of the IMU and of the fixes."""
     k, size, intervals = len(problem.intervals.keyframes), len(begins) + 5, problem.intervals
-    T, velocities, _ = fit.states
+    T, velocities = motion_from(fit.values)
     turned = np.add.reduceat(intervals.angular_rate * intervals.durations[:, None], intervals.bounds[:-1])
     axis = upright_axis(intervals.specific_force)
     rates = turned[:, axis] / np.diff(intervals.keyframes)

@@ -7,13 +7,15 @@ can move it far. What the motion excludes is not taken.
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
 from factor_graphs.calibration import Calibration
 from factor_graphs.chi_square import quantile
 from factor_graphs.dead_reckoning import agreement, way_of, windows_of
 from factor_graphs.measurements import GnssFixes, ImuSamples
+
+Array = NDArray[np.float64]
 
 # Offsets tried, s: as far as the message of a receiver may be late, and beyond the one in question. Dead reckoning does
 # not judge what is smaller than the last.

@@ -12,10 +12,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array
 from factor_graphs.elimination import PLACES, SIZE, eliminate, split, split_key, state_keys
+from factor_graphs.model import motion_from
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 # Without relative poses anchors are so far apart, s.
 ANCHOR_S = 1.5
@@ -100,7 +102,7 @@ def condense(problem: Problem, fit: Fit, position_variances: Array) -> Condensed
     place = {int(keyframe): n for n, keyframe in enumerate(anchors)} | {
         len(problem.intervals.keyframes): len(anchors)
     }
-    T = fit.states[0]
+    T, _ = motion_from(fit.values)
     rows = tuple(_rows(factor, place) for factor in _remaining(fit, np.setdiff1d(np.arange(len(T)), anchors)))
     return CondensedDrive(problem.intervals.keyframes[anchors], T[anchors], rows, position_variances)
 

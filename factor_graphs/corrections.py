@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array, Rows
 from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +40,13 @@ class Correction:
             velocities = np.einsum("kij,kj->ki", turn, velocities) + growing
         return Trajectory(trajectory.stamps, T, velocities, self._covariances(trajectory, i, u))
 
-    def _shifts(self, turns: Rotation, anchor: Rows, trajectory: Trajectory) -> Array:
+    def _shifts(self, turns: Rotation, anchor: NDArray[np.intp], trajectory: Trajectory) -> Array:
         """How far the rigid motions of these anchors, one for each pose, move the positions (k, 3)."""
         arm = trajectory.positions - self.before[anchor, :3, 3]
         moved: Array = self.after[anchor, :3, 3] - self.before[anchor, :3, 3] + turns[anchor].apply(arm) - arm
         return moved
 
-    def _covariances(self, trajectory: Trajectory, i: Rows, u: Array) -> Array | None:
+    def _covariances(self, trajectory: Trajectory, i: NDArray[np.intp], u: Array) -> Array | None:
         if trajectory.covariances is None:
             return None
         at_anchors = np.searchsorted(trajectory.stamps, self.stamps).clip(max=len(trajectory) - 1)
@@ -56,7 +58,7 @@ class Correction:
         return moved
 
 
-def _segments(t: Array, stamps: Array) -> tuple[Rows, Array]:
+def _segments(t: Array, stamps: Array) -> tuple[NDArray[np.intp], Array]:
     """The anchor before each stamp, and how far (k, 1) it is on the way to the next one, from 0 to 1."""
     i = np.clip(np.searchsorted(stamps, t, side="right") - 1, 0, len(stamps) - 2)
     return i, np.clip((t - stamps[i]) / (stamps[i + 1] - stamps[i]), 0.0, 1.0)[:, None]

@@ -9,14 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Complex
-from factor_graphs.chi_square import NEVER_ZERO
-from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import GnssFixes, ImuSamples
 
-# Long enough that a turn or a stop stands out from metres of noise.
-WINDOW_S = HEADING_HOLDS_S
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# Long enough that a turn or a stop stands out from metres of noise, short enough that a consumer gyroscope holds.
+WINDOW_S = 20.0
 LEAST_FIXES = 7
 MOST_WINDOWS, MOST_FIXES = 30, 40
 
@@ -28,7 +29,7 @@ def integral(stamps: Array, values: Array) -> Array:
     return np.concatenate([np.zeros_like(values[:1]), np.cumsum(parts, axis=0)])
 
 
-def way_of(imu: ImuSamples, lever: complex = 0j, *, mirrored: bool = False) -> Complex:
+def way_of(imu: ImuSamples, lever: complex = 0j, *, mirrored: bool = False) -> NDArray[np.complex128]:
     """The way of a point at `lever` m (ahead + i left) of an IMU with z up: (n,) m, up to a line and a parabola.
 
     East + i north up to a first heading: the accelerometer integrated twice along the gyroscope's heading.
@@ -88,7 +89,7 @@ def agreement(windows: Windows, stamps: Array, way: Complex, lag_s: float = 0.0)
     x = _beside_parabola(windows, _at(windows, stamps, way, lag_s))
     y = _beside_parabola(windows, windows.places)
     power = np.sum(np.abs(x) ** 2, axis=1)
-    scales = np.sum(np.conj(x) * y, axis=1) / np.maximum(power, NEVER_ZERO)
+    scales = np.sum(np.conj(x) * y, axis=1) / np.maximum(power, 1e-12)
     errors = y - scales[:, None] * x
     return Agreement(float(np.sum(np.abs(errors) ** 2)), _independent_errors(windows, errors))
 
@@ -96,7 +97,7 @@ def agreement(windows: Windows, stamps: Array, way: Complex, lag_s: float = 0.0)
 def _independent_errors(windows: Windows, errors: Complex) -> float:
     """How many independent errors (w, k) are, by how alike neighbours are; windows overlap by a half."""
     rest = float(np.sum(np.abs(errors) ** 2))
-    alike = float(np.sum(errors[:, 1:] * np.conj(errors[:, :-1])).real) / max(rest, NEVER_ZERO)
+    alike = float(np.sum(errors[:, 1:] * np.conj(errors[:, :-1])).real) / max(rest, 1e-12)
     alike = min(max(alike, 0.0), 0.99)
     # a parabola, a scale and a heading were taken off each window
     free = max(float(windows.counts.sum()) - 4.0 * len(errors), 1.0) * (1.0 - alike) / (1.0 + alike)

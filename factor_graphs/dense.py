@@ -8,13 +8,15 @@ the most probable path between the two ends, and there is no step at a keyframe.
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array, Rows
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import ImuIntervals
 from factor_graphs.measurements import ImuNoise
-from factor_graphs.trajectory import Trajectory, turned
+from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 # Intervals are made dense in blocks of so many nodes, few enough for the cache: in one piece, with 200 MB for every
 # intermediate result, a drive of two hours took a sixth more CPU time as a whole.
@@ -90,7 +92,7 @@ def _move(
     keyframes: Trajectory,
     R: Array,
     force: Array,
-    which: Rows,
+    which: NDArray[np.intp],
     u: Array,
     frame: LocalFrame,
 ) -> tuple[Array, Array, Array, Array]:
@@ -107,14 +109,16 @@ def _move(
     return v, v_end, p_end - step, p_end
 
 
-def _sum_since_keyframe(steps: Array, bounds: Rows, which: Rows) -> Array:
+def _sum_since_keyframe(steps: Array, bounds: NDArray[np.intp], which: NDArray[np.intp]) -> Array:
     total = np.cumsum(steps, axis=0)
     before = np.concatenate([np.zeros((1, 3)), total[bounds[1:-1] - 1]])
     since: Array = total - before[which]
     return since
 
 
-def _covariances(keyframes: Trajectory, T: Array, noise: list[ImuNoise], which: Rows, u: Array) -> Array:
+def _covariances(
+    keyframes: Trajectory, T: Array, noise: list[ImuNoise], which: NDArray[np.intp], u: Array
+) -> Array:
     """Pose covariances at every node: the keyframes' own, mixed, and the noise of the bridge between them.
 
     The error of the path is the mixture of the two ends' errors, so the mixture of their covariances is an
@@ -122,7 +126,7 @@ def _covariances(keyframes: Trajectory, T: Array, noise: list[ImuNoise], which: 
     d² S u (1 - u) to a turn and d² S³ (u (1 - u))³ / 3 to a position.
     """
     assert keyframes.covariances is not None
-    in_map = turned(keyframes.covariances, keyframes.T_map_imu[:, :3, :3])
+    in_map = _turned(keyframes.covariances, keyframes.T_map_imu[:, :3, :3])
     mixed, change = in_map[np.append(which, -1)], np.diff(in_map, axis=0)[which]
     change *= u[:, None, None]
     mixed[:-1] += change
@@ -132,4 +136,12 @@ def _covariances(keyframes: Trajectory, T: Array, noise: list[ImuNoise], which: 
     for axis in range(3):
         mixed[:-1, axis, axis] += rotation[which] * bridge
         mixed[:-1, 3 + axis, 3 + axis] += position[which] * bridge**3
-    return turned(mixed, np.swapaxes(T[:, :3, :3], 1, 2))
+    return _turned(mixed, np.swapaxes(T[:, :3, :3], 1, 2))
+
+
+def _turned(covariances: Array, R: Array) -> Array:
+    """Covariances (n, 6, 6) of rotation and translation, both seen in axes turned by R (n, 3, 3)."""
+    both = np.zeros_like(covariances)
+    both[:, :3, :3] = both[:, 3:, 3:] = R
+    back = np.swapaxes(both, 1, 2).copy()  # NumPy takes twice as long for a view
+    return np.asarray(both @ covariances @ back, np.float64)

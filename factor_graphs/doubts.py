@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array
 from factor_graphs.calibration import Calibration
 from factor_graphs.fitting import FITTING_CHI2
 from factor_graphs.heading import stddevs_of_heading
@@ -13,6 +13,8 @@ from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Prob
 from factor_graphs.screening import are_drifting
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.variance import correlation_time_shown
+
+Array = NDArray[np.float64]
 
 # Beyond 99.9 % of good relative poses one is rejected: so many in a hundred are ten times what chance takes.
 NOTABLE_REJECTION = 0.01
@@ -40,7 +42,7 @@ def doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Calib
             f"the fixes scatter {problem.of_fixes:.1f} times as much as they say: taken into account; do all come from"
             " one antenna, with its lever arm?"
         )
-    if fit.chi2_per_dof > FITTING_CHI2:
+    if fit.chi2_per_dof > FITTING_CHI2[1]:
         yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something does not fit"
     if calibration.time_offset_s:
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"

@@ -1,26 +1,20 @@
-"""The graph of a drive eliminated by QR, keyframe by keyframe, and the covariance of every keyframe from that.
+"""The graph of a drive eliminated by QR, keyframe by keyframe: what each one is, given those that come later.
 
 A keyframe is one dense QR of its factors and of what the ones before it left, so time and memory grow with the length
-of the drive. GTSAM's own eliminations hold all rows that they began with, 40 to 100 kB per keyframe; its `Marginals`
-goes through Cholesky, which squares the condition of the problem, and throws where a stiff IMU meets a weak prior: an
-ordinary short drive. The conditionals are R x = d - S y on later keyframes y, and the covariances follow backwards:
-cov(x) = R⁻¹ R⁻ᵀ + W cov(y) Wᵀ with W = R⁻¹ S (Kaess and Dellaert 2009).
+of the drive. GTSAM's own eliminations hold all rows that they began with, 40 to 100 kB per keyframe.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
-from itertools import pairwise
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, M, V, W, X
-from scipy.linalg.lapack import dtrtri
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Rows
-
+Array = NDArray[np.float64]
 Graph = TypeVar("Graph", gtsam.NonlinearFactorGraph, gtsam.GaussianFactorGraph)
 Group = tuple[int, ...]
 """Keys that are eliminated together: those of one keyframe, or of what all keyframes share."""
@@ -144,72 +138,3 @@ def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
 def split_key(key: int) -> tuple[int, int]:
     """Letter and index of a key."""
     return key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1
-
-
-Places = dict[int, Rows]
-"""Where the numbers of a key stand in a joint covariance."""
-
-
-class Visitor(Protocol):
-    """Sees every keyframe i of x_i = -W y + noise, with y at `rows` of those known before; now they are `known`.
-
-    `joint` is the covariance of all that are known now: the keyframe, in its 15 numbers, then y.
-    """
-
-    def add(self, i: int, W: Array, rows: Rows, joint: Array, known: Places) -> None: ...
-
-
-def keyframe_covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, also: Visitor | None = None
-) -> tuple[Array, Array]:
-    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k) and W(k), where they are.
-
-    M(k) and W(k), the mounting of the IMU and the calibration of the wheels, are what all keyframes share: they are
-    eliminated last, as if they were one more keyframe. `also` is shown the joint covariance of each with those it is
-    given, from the last keyframe to the first.
-    """
-    shared = shared_keys(values, k)
-    groups = by_sections(graph, k, shared) if also is None else in_time(k, shared)
-    linear = (part.linearize(values) for part in split(graph, groups))
-    net = list(conditionals(linear, groups))
-    children = Counter(one.parent for one in net)
-    covariances, of_shared = np.empty((k, SIZE, SIZE)), np.empty((0, 0))
-    # The joint covariance of a group and of those it is given, as long as it has children to come: memory does not
-    # grow with the drive. Of what a group is given, its parent is eliminated first, and is given all the rest.
-    joints: dict[int, tuple[Places, Array]] = {-1: ({}, np.empty((0, 0)))}
-    for n in range(len(net) - 1, -1, -1):
-        one, keys = net.pop(), groups[n]
-        (known, of_parent), size = joints[one.parent], len(one.R)
-        rows = np.concatenate([known[key] for key in one.later]) if one.later else np.empty(0, np.intp)
-        own, _ = dtrtri(one.R)
-        W, given = own @ one.S, of_parent[rows[:, None], rows]
-        cross = -W @ given
-        covariance = own @ own.T - cross @ W.T
-        joint = np.empty((size + len(rows),) * 2)
-        joint[:size, :size] = (covariance + covariance.T) / 2
-        joint[:size, size:], joint[size:, :size], joint[size:, size:] = cross, cross.T, given
-        known = _places([*keys, *one.later])
-        if keys == shared:
-            of_shared = joint[:size, :size]
-        else:
-            i = split_key(keys[0])[1]
-            covariances[i] = joint[:size, :size]
-            if also is not None:
-                also.add(i, W, rows, joint, known)
-        joints[n] = known, joint
-        children[one.parent] -= 1
-        for m in (n, one.parent):
-            if not children[m]:
-                joints.pop(m, None)
-    return covariances, of_shared
-
-
-def _places(keys: list[int]) -> Places:
-    """Where the numbers of each of these keys stand, when they are put one after the other."""
-    return dict(zip(keys, _ranges(tuple([split_key(key)[0] for key in keys])), strict=True))
-
-
-@cache
-def _ranges(letters: tuple[int, ...]) -> list[Rows]:
-    ends = np.cumsum([0, *(len(PLACES[letter]) for letter in letters)]).tolist()
-    return [np.arange(*both) for both in pairwise(ends)]

@@ -5,9 +5,10 @@ the log that ships with GTSAM three of eight gaps of 1.6 s hide 7 to 12° of hea
 """
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
 
-from factor_graphs.arrays import Array, Mask
+Array = NDArray[np.float64]
 
 # Of the usual bend between three samples; noise is in every channel, and bends all of them less once in 1e14 samples.
 STRAIGHT = 0.01
@@ -15,7 +16,7 @@ STRAIGHT = 0.01
 FEWEST = 5
 
 
-def filled_in(stamps: Array, values: Array) -> Mask:
+def filled_in(stamps: Array, values: Array) -> NDArray[np.bool_]:
     """Which samples (n,) lie on a straight line between others, in every channel: no sensor with noise gives them.
 
     `stamps` (n,) s, increasing; `values` (n, c). Lines are straight in time or from row to row. What stays the same
@@ -27,7 +28,7 @@ def filled_in(stamps: Array, values: Array) -> Mask:
     return filled
 
 
-def _on_lines(values: Array, steps: Array) -> Mask:
+def _on_lines(values: Array, steps: Array) -> NDArray[np.bool_]:
     """Of every sample but the first and the last, whether all channels go on there as they came."""
     found = np.ones(len(values) - 2, dtype=bool)
     for channel in values.T:

@@ -4,12 +4,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
 from factor_graphs.errors import MeasurementError
+
+Array = NDArray[np.float64]
 
 # WGS 84 (NIMA TR8350.2): semi-major axis m, flattening, GM m³/s², rotation rad/s
 SEMI_MAJOR_AXIS = 6378137.0

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
-from factor_graphs.chi_square import ROUNDS
 from factor_graphs.corrections import Correction
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import GnssFixes, ImuSamples
@@ -17,6 +15,8 @@ from factor_graphs.model import relative_pose_factors
 from factor_graphs.problem import RELATIVE_LOSSES
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 # Fixes are not taken to be better than this, m: the lever arm and the clock are in it.
 LEAST_CLAIM_M = 0.3
@@ -26,6 +26,7 @@ FITTING = 3.0
 UNKNOWN_HEADING = 0.05
 # A fit of roll and pitch, too, is taken where it leaves less than this share of the distances.
 TILTED = 0.7
+REWEIGHTED = 10
 # A vehicle that turns less, rad/s, shows nothing; of what it turns, so much may differ.
 STRAIGHT, DIFFERENT = 0.02, 0.5
 # Turns are compared over this long, s, and clocks that differ by as much.
@@ -73,7 +74,7 @@ def _antenna(trajectory: Trajectory, fixes: GnssFixes, p_imu_antenna: ArrayLike)
 def _robust(p: Array, q: Array, claimed: Array, is_level: bool) -> Array:
     """T with q = T p, by weights that fall where points are farther off than usual."""
     weights = claimed**-2
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHTED):
         T = _rigid(p, q, weights, is_level)
         off = np.linalg.norm(p @ T[:3, :3].T + T[:3, 3] - q, axis=1) / claimed
         weights = claimed**-2 / np.maximum(1.0, off / max(2 * float(np.median(off)), 1e-9)) ** 2

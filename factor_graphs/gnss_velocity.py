@@ -10,13 +10,17 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask
-from factor_graphs.chi_square import HUBER, quantile
+from factor_graphs.chi_square import quantile
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.measurements import UNMEASURED, GnssVelocities
+from factor_graphs.model import from_values
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.side_measurements import FEWEST_SEEN, Observed, Placed, noise_scale, placed
 from factor_graphs.vehicle import MOVING_SPEED, beside_fixes
+
+Array = NDArray[np.float64]
 
 # Velocities that differ from those of the positions by more than this share of the speed are something else.
 MOST_MISFIT = 0.1
@@ -28,7 +32,8 @@ MISTAKES = {
     "north, east, not east, north": np.array([[0.0, 1.0], [1.0, 0.0]]),
     "backwards": -np.eye(2),
 }
-LOSS = gtsam.noiseModel.mEstimator.Huber.Create(quantile(HUBER, 3) ** 0.5)
+# One velocity in twenty of a good receiver has Huber's loss, and every wrong one.
+LOSS = gtsam.noiseModel.mEstimator.Huber.Create(quantile(0.95, 3) ** 0.5)
 
 
 def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit) -> Observed:
@@ -38,7 +43,8 @@ def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit) -
     off = kept.velocities - _antenna_velocities(problem, fit, place)
     seen = beside_fixes(problem, fit)[place.at]
     said = f"GNSS velocity: {len(kept)} of {len(velocities)} used"
-    turned = np.einsum("kij,kj->ki", fit.states[0][place.at, :3, :3], kept.velocities)
+    R = from_values(fit.values, len(problem.intervals.keyframes))[0][place.at, :3, :3]
+    turned = np.einsum("kij,kj->ki", R, kept.velocities)
     if doubt := _mistake(kept.velocities[seen], (kept.velocities - off)[seen], turned[seen]):
         return Observed(f"GNSS velocity off: {doubt}", doubtful=True)
     scales = _noise_shown(problem, fit, place, off, kept.stddevs, seen)
@@ -50,8 +56,9 @@ def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit) -
 
 def _antenna_velocities(problem: Problem, fit: Fit, place: Placed) -> Array:
     """Velocities (r, 3) m/s of the antenna that a solution says."""
-    T, v, biases = fit.states
-    changes = np.gradient(v, problem.intervals.keyframes, axis=0)[place.at] * place.late[:, None]
+    stamps = problem.intervals.keyframes
+    T, v, biases = from_values(fit.values, len(stamps))
+    changes = np.gradient(v, stamps, axis=0)[place.at] * place.late[:, None]
     turning = np.cross(problem.intervals.rates - biases[:, 3:], problem.p_imu_antenna)[place.at]
     found: Array = v[place.at] + changes + np.einsum("kij,kj->ki", T[place.at, :3, :3], turning)
     return found
@@ -78,9 +85,12 @@ def _misfit(said: Array, known: Array) -> float:
     return float(np.median(np.linalg.norm(said - known, axis=1) / np.linalg.norm(known, axis=1)))
 
 
-def _noise_shown(problem: Problem, fit: Fit, place: Placed, off: Array, stddevs: Array, seen: Mask) -> Array:
+def _noise_shown(
+    problem: Problem, fit: Fit, place: Placed, off: Array, stddevs: Array, seen: NDArray[np.bool_]
+) -> Array:
     """As if of how many times more noise than stated velocities count, level and up, (2,): at least 1."""
-    own = np.diagonal(fit.covariances[place.at, 6:9, 6:9], axis1=1, axis2=2)
+    covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
+    own = np.diagonal(covariances[place.at, 6:9, 6:9], axis1=1, axis2=2)
     scales = np.ones(2)
     for row, axes in enumerate(([0, 1], [2])):
         rows = seen & (stddevs[:, axes] < UNMEASURED).all(axis=1)
@@ -95,13 +105,11 @@ def _factors(
     velocities: GnssVelocities, problem: Problem, place: Placed, fit: Fit
 ) -> list[gtsam.NonlinearFactor]:
     """Every velocity holds that of its keyframe."""
-    of_turn = _antenna_velocities(problem, fit, place) - fit.states[1][place.at]
-    of_imu = velocities.velocities - of_turn
+    states = from_values(fit.values, len(problem.intervals.keyframes))[1]
+    of_imu = velocities.velocities - (_antenna_velocities(problem, fit, place) - states[place.at])
     return [
         gtsam.PriorFactorVector(
-            V(i),
-            velocity,
-            gtsam.noiseModel.Robust.Create(LOSS, gtsam.noiseModel.Diagonal.Sigmas(stddevs)),
+            V(i), velocity, gtsam.noiseModel.Robust.Create(LOSS, gtsam.noiseModel.Diagonal.Sigmas(stddevs))
         )
         for i, velocity, stddevs in zip(place.at.tolist(), of_imu, velocities.stddevs, strict=True)
     ]

@@ -7,12 +7,14 @@ optimiser does not come back from it. So what exceeds any calibrated unit is tak
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from factor_graphs.arrays import Array, Complex
-from factor_graphs.at_rest import QUIETEST_OF_DRIVE, are_quiet, means_of, windows
-from factor_graphs.chi_square import BEYOND_DOUBT, NEVER_ZERO
+from factor_graphs.at_rest import Windows
+from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.measurements import GnssFixes, ImuSamples
+
+Array = NDArray[np.float64]
 
 # A bias below this, rad/s (0.6 deg/s), the graph finds by itself; above the second no gyroscope is of use.
 NOTABLE, LARGEST = 0.01, 0.2
@@ -30,6 +32,7 @@ SURELY, AGREEING = BEYOND_DOUBT**2 / 2, 0.5
 STAYING, LEAST_STANDING, STEADY = 3.0, 5, 3e-3
 # A mean specific force beyond these, m/s², is no gravity, and does not tell what is up.
 LEAST_FORCE, MOST_FORCE = 5.0, 20.0
+TINY = 1e-12
 
 
 def large_gyroscope_bias(imu: ImuSamples, fixes: GnssFixes) -> Array:
@@ -40,7 +43,7 @@ def large_gyroscope_bias(imu: ImuSamples, fixes: GnssFixes) -> Array:
     """
     nothing, fixes = np.zeros(3), fixes[(fixes.stamps >= imu.stamps[0]) & (fixes.stamps <= imu.stamps[-1])]
     force = imu.specific_force.mean(axis=0)
-    up = force / max(float(np.linalg.norm(force)), NEVER_ZERO)
+    up = force / max(float(np.linalg.norm(force)), TINY)
     if len(fixes) < 3 or not LEAST_FORCE < np.linalg.norm(force) < MOST_FORCE:
         return nothing
     rest = _at_rest(imu, fixes)
@@ -65,7 +68,7 @@ class _Courses:
     """
 
     stamps: Array
-    doubled: Complex
+    doubled: NDArray[np.complex128]
 
     @classmethod
     def of(cls, imu: ImuSamples, fixes: GnssFixes, up: Array) -> "_Courses":
@@ -74,12 +77,10 @@ class _Courses:
         turned = np.interp(
             stamps, imu.stamps, cumulative_trapezoid(imu.angular_rate @ up, imu.stamps, initial=0)
         )
-        of_course = np.maximum(stddevs / np.maximum(np.abs(ways), NEVER_ZERO), LEAST_COURSE_STDDEV)
+        of_course = np.maximum(stddevs / np.maximum(np.abs(ways), TINY), LEAST_COURSE_STDDEV)
         # concentration of twice the angle (von Mises); one fix is in several ways
         weights = (
-            1
-            / (4 * of_course**2)
-            / max(len(ways) * CHORD_S / max(float(np.ptp(fixes.stamps)), NEVER_ZERO), 1.0)
+            1 / (4 * of_course**2) / max(len(ways) * CHORD_S / max(float(np.ptp(fixes.stamps)), TINY), 1.0)
         )
         return cls(stamps, weights * np.exp(2j * (np.angle(ways) - turned)))
 
@@ -101,7 +102,7 @@ def _if_large(bias: Array) -> Array:
     return bias if NOTABLE < np.abs(bias).max() < LARGEST else np.zeros(3)
 
 
-def _ways(fixes: GnssFixes) -> tuple[Array, Complex, Array]:
+def _ways(fixes: GnssFixes) -> tuple[Array, NDArray[np.complex128], Array]:
     """From fix to fix: the middle of the time (n,) s, the way as a complex number, m, and its standard deviation, m."""
     first = np.arange(len(fixes))
     last = np.searchsorted(fixes.stamps, fixes.stamps + CHORD_S)
@@ -116,9 +117,8 @@ def _ways(fixes: GnssFixes) -> tuple[Array, Complex, Array]:
 
 def _at_rest(imu: ImuSamples, fixes: GnssFixes) -> Array | None:
     """The median rate (3,) of the seconds in which the vehicle stands; None for less than a few of them."""
-    second = windows(imu)
-    quiet = are_quiet(second, imu.specific_force, imu.angular_rate, QUIETEST_OF_DRIVE)
-    rates = means_of(second, imu.angular_rate)
+    seconds = Windows.of(imu)
+    quiet, rates = seconds.quiet(0.1), seconds.rate
     stamps = np.arange(len(quiet)) + imu.stamps[0] + 0.5
     middles, ways, stddevs = _ways(fixes)
     if not len(ways):

@@ -7,20 +7,25 @@ not known at all.
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
-from factor_graphs.chi_square import RARE, quantile
+from factor_graphs.chi_square import quantile
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import EstimationError
-from factor_graphs.imu_noise import HEADING_HOLDS_S
-from factor_graphs.model import to_values
+from factor_graphs.model import from_values, motion_from, to_values
 from factor_graphs.problem import Fit, Problem, fit_as_expected
 
-# Slower than this, m/s, nearly always, the course does not tell the heading; a prior below this, rad, does.
-SLOW_MPS, UNKNOWN = 3.0, 1.0
+Array = NDArray[np.float64]
+
+# Slower than this, m/s, over so many s, nearly always, the course does not tell the heading; a prior below this, rad,
+# does.
+SLOW_MPS, COURSE_S, UNKNOWN = 3.0, 20.0, 1.0
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
 # Another heading, so far away, rad, fits as well when its cost is that of a good one of 999 in a thousand.
-APART, AS_GOOD = 0.5, quantile(RARE, 1)
+APART, AS_GOOD = 0.5, quantile(0.999, 1)
+# Within so many standard deviations a heading is sure.
+SURELY = 3.0
 # Standard deviation of a heading that may be any, rad.
 ANY = np.pi / np.sqrt(3)
 
@@ -35,15 +40,16 @@ def with_heading(problem: Problem) -> Problem:
         return problem
     middle = len(problem.intervals.keyframes) // 2
     costs = np.array([2 * fit.graph.error(fit.values) for _, fit in found])
-    R_map_imu = np.stack([fit.states[0][middle, :3, :3] for _, fit in found])
+    R_map_imu = np.stack([motion_from(fit.values)[0][middle, :3, :3] for _, fit in found])
     best, best_fit = found[int(costs.argmin())]
     off = Rotation.from_matrix(R_map_imu @ R_map_imu[int(costs.argmin())].T).as_rotvec()[:, 2]
     as_good = costs - costs.min() < AS_GOOD
     in_doubt = bool(np.any(as_good & (np.abs(off) > APART)))
     if len(found) < len(tried):  # a guess without solution excludes no heading
-        known = stddevs_of_heading(best_fit.states[0][:, :3, :3], best_fit.covariances).min()
-        in_doubt |= bool(AS_GOOD**0.5 * known > APART)
-    return replace(best, guess=best_fit.states[:2], heading_in_doubt=in_doubt)
+        T, _ = motion_from(best_fit.values)
+        covariances, _ = keyframe_covariances(best_fit.graph, best_fit.values, len(T))
+        in_doubt |= bool(SURELY * stddevs_of_heading(T[:, :3, :3], covariances).min() > APART)
+    return replace(best, guess=motion_from(best_fit.values), heading_in_doubt=in_doubt)
 
 
 def stddevs_of_heading(R_map_imu: Array, covariances: Array) -> Array:
@@ -60,7 +66,7 @@ def turned_to(problem: Problem, fit: Fit, turn: float) -> tuple[Problem, Fit]:
     """A solution that does not know its heading, turned by `turn` rad about up: another measurement knows it."""
     if turn == 0.0:
         return problem, fit
-    T, velocities, biases = fit.states
+    T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
     turned = _turned(replace(problem, guess=(T, velocities)), float(np.degrees(turn)))
     found = replace(fit, values=to_values(turned.guess[0], velocities, biases))
     return replace(turned, heading_in_doubt=False), found
@@ -69,8 +75,8 @@ def turned_to(problem: Problem, fit: Fit, turn: float) -> tuple[Problem, Fit]:
 def _is_slow(problem: Problem) -> bool:
     """Whether it gets nowhere fast: a speed from fix to fix is mostly their noise."""
     stamps, level = problem.intervals.keyframes, problem.guess[0][:, :2, 3]
-    first = np.flatnonzero(stamps <= max(stamps[-1] - HEADING_HOLDS_S, stamps[0]))
-    last = np.minimum(np.searchsorted(stamps, stamps[first] + HEADING_HOLDS_S), len(stamps) - 1)
+    first = np.flatnonzero(stamps <= max(stamps[-1] - COURSE_S, stamps[0]))
+    last = np.minimum(np.searchsorted(stamps, stamps[first] + COURSE_S), len(stamps) - 1)
     speeds = np.linalg.norm(level[last] - level[first], axis=1) / (stamps[last] - stamps[first])
     return bool(np.quantile(speeds, 0.9) < SLOW_MPS)
 

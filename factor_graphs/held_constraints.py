@@ -6,25 +6,29 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import M, W
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask
-from factor_graphs.at_rest import (
+from factor_graphs.constraints import (
     CREEPING_SPEED,
     creeping,
+    non_holonomic_factors,
     quiet_intervals,
     resting,
     standing,
 )
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.fitting import FITTING_CHI2, fit_noise_from
 from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import WheelSpeeds
-from factor_graphs.model import zero_motion_factors, zero_velocity_factors
+from factor_graphs.model import from_values, zero_motion_factors, zero_velocity_factors
 from factor_graphs.problem import RELATIVE_TOLERANCE, ROUGH, Fit, Problem
 from factor_graphs.side_measurements import Observed, factors_of
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
-from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, non_holonomic_factors, observe
+from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe
 from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors
+
+Array = NDArray[np.float64]
 
 # A course that may be so far off the heading, rad, shows no slip: a boat that drifts looks like a car. Only a motion
 # with less horizontal acceleration, m/s², nearly always, leaves the heading so unknown.
@@ -54,11 +58,11 @@ class _Held:
         """As in `optimise`, for the next solution."""
         return RELATIVE_TOLERANCE if self.axle is None and self.wheels is None else ROUGH
 
-    def stands(self, problem: Problem, fit: Fit, quiet: Mask) -> Mask:
+    def stands(self, problem: Problem, fit: Fit, quiet: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """The keyframes (k,) at which the vehicle stands by the solution, by fixes that fit it, and by its wheels."""
         slow, fits = standing(quiet, self.motion.velocity, CREEPING_SPEED), fit.weights > 0.5
         creeps = creeping(slow, problem.fixes[fits], problem.at[fits])
-        still: Mask = standing(quiet, self.motion.velocity) & ~creeps
+        still: NDArray[np.bool_] = standing(quiet, self.motion.velocity) & ~creeps
         return still if self.wheels is None else still & ~self.wheels.readings.moving
 
     def with_shared(self, problem: Problem, fit: Fit) -> Fit:
@@ -74,7 +78,7 @@ class _Held:
             values.insert(key, value)
         return replace(fit, values=values)
 
-    def factors(self, problem: Problem, fit: Fit, stands: Mask) -> list[gtsam.NonlinearFactor]:
+    def factors(self, problem: Problem, fit: Fit, stands: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
         """What holds where it stands, and of axle and wheels, linearised at a solution."""
         settings, keyframes = problem.settings, problem.intervals.keyframes
         R_map_imu = np.swapaxes(self.motion.R_imu_map, 1, 2)
@@ -97,7 +101,7 @@ class _Held:
         """Whether the IMU fits no longer with the slip that was found: the constraint is stiffer than the axle."""
         if self.axle is None or self.slips is None or self.slips[0] == self.slips[1]:
             return False
-        return fit.inflation > start.inflation or fit.chi2_per_dof > FITTING_CHI2
+        return fit.inflation > start.inflation or fit.chi2_per_dof > FITTING_CHI2[1]
 
     def with_first_slip(self) -> "_Held":
         """The same with the slip that the axle was held with first, for good."""
@@ -148,7 +152,7 @@ def constrain(
     rolling = wheels if wheels and (settings.wheel_speed == "on" or not wheels.doubt) else None
     held = _Held(motion, mounting, axle, rolling, settled=axle is None and rolling is None)
     factors: list[gtsam.NonlinearFactor] = []
-    stood: Mask | None = None
+    stood: NDArray[np.bool_] | None = None
     for _ in range(ROUNDS):
         stands = held.stands(problem, fit, quiet)
         if held.settled and stood is not None and np.array_equal(stands, stood):
@@ -202,14 +206,16 @@ def _observed(
 
 def _heading_if_gentle(problem: Problem, fit: Fit) -> float:
     """Usual standard deviation of the heading, rad; 0 where it is certainly small, for turns and braking show it."""
-    T, velocities, _ = fit.states
+    k = len(problem.intervals.keyframes)
+    T, velocities, _ = from_values(fit.values, k)
     changes = np.diff(velocities[:, :2], axis=0) / np.diff(problem.intervals.keyframes)[:, None]
     if np.quantile(np.linalg.norm(changes, axis=1), 0.9) > GENTLE:
         return 0.0
-    return float(np.median(stddevs_of_heading(T[:, :3, :3], fit.covariances)))
+    covariances, _ = keyframe_covariances(fit.graph, fit.values, k)
+    return float(np.median(stddevs_of_heading(T[:, :3, :3], covariances)))
 
 
-def _quiet(problem: Problem) -> Mask:
+def _quiet(problem: Problem) -> NDArray[np.bool_]:
     """The intervals (k - 1,) in which the vehicle may be held still."""
     if problem.settings.standing_stddev_mps is None:
         return np.zeros(len(problem.intervals.keyframes) - 1, dtype=bool)

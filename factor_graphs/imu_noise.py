@@ -7,8 +7,6 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 STANDARD_GRAVITY = 9.80665
-HEADING_HOLDS_S = 20.0
-"""So long the gyroscope of a consumer holds a heading better than a course tells it; what is slower is drift."""
 DATA_SHEET = {
     "angular_random_walk_deg_per_sqrt_h": ("gyroscope_noise_density", pi / 180 / 60),
     "gyroscope_noise_deg_per_s_per_sqrt_hz": ("gyroscope_noise_density", pi / 180),

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import ImuNoise, ImuSamples
+
+Array = NDArray[np.float64]
 
 # A fix this close to a keyframe is taken at the keyframe; shorter intervals have no usable covariance.
 SAME_STAMP_S = 5e-4
@@ -41,11 +42,11 @@ class ImuIntervals:
     """
 
     keyframes: Array
-    bounds: Rows
+    bounds: NDArray[np.intp]
     nodes: Array
     specific_force: Array
     angular_rate: Array
-    blind: Mask
+    blind: NDArray[np.bool_]
 
     @property
     def durations(self) -> Array:
@@ -85,7 +86,7 @@ class ImuIntervals:
             _unseen(noise, span) if blind else noise for span, blind in zip(spans, self.blind, strict=True)
         ]
 
-    def keyframe_of(self, stamps: Array) -> Rows:
+    def keyframe_of(self, stamps: Array) -> NDArray[np.intp]:
         """Index of the keyframe nearest to each stamp."""
         return nearest(self.keyframes, stamps)
 
@@ -133,7 +134,7 @@ def _steps(imu: ImuSamples, keyframes: Array) -> tuple[Array, Array, Array]:
     return nodes, (force[:-1] + later) / 2, rate
 
 
-def nearest(known: NDArray[Any], wanted: NDArray[Any]) -> Rows:
+def nearest(known: NDArray[Any], wanted: NDArray[Any]) -> NDArray[np.intp]:
     """Index of the nearest of those `known`, sorted, to each one wanted; the earlier where both are as near."""
     right = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
     left = np.maximum(right - 1, 0)

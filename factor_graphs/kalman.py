@@ -8,21 +8,21 @@ error is (rotation in imu axes, position, velocity, accelerometer bias, gyroscop
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array, Mask
-from factor_graphs.chi_square import RARE, quantile
+from factor_graphs.chi_square import quantile
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.model import skew
 from factor_graphs.problem import Problem, pose_problem
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.trajectory import Trajectory
 
+Array = NDArray[np.float64]
+
 THETA, P, V, BA, BG = (slice(i, i + 3) for i in range(0, 15, 3))
 # A fix this unlikely is not used. After so many in a row it is the filter that is wrong, not the fixes.
-GATE, RE_ACQUIRE_AFTER = quantile(RARE, 3), 6
+GATE, RE_ACQUIRE_AFTER = quantile(0.999, 3), 6
 # What the first guess is good for: roll, pitch, heading rad, position m, speed m/s.
 GUESS_STDDEVS = (0.1, 0.1, 0.2, 5.0, 5.0, 5.0, 3.0, 3.0, 3.0)
 # The covariance is propagated once per so many IMU steps.
@@ -40,7 +40,7 @@ class KalmanSolution:
     filtered: Trajectory
     smoothed: Trajectory
     nis: Array
-    gated: Mask
+    gated: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ def kalman_smooth(
     return KalmanSolution(_trajectory(stamps, filtered), _trajectory(stamps, smoothed[::-1]), nis, gated)
 
 
-def _filter(problem: Problem) -> tuple[list[_State], list[_State], list[Array], Array, Mask]:
+def _filter(problem: Problem) -> tuple[list[_State], list[_State], list[Array], Array, NDArray[np.bool_]]:
     noise = problem.intervals.noise(problem.noise)
     fix_at = dict(zip(problem.at.tolist(), range(len(problem.fixes)), strict=True))
     nis, gated, refused = np.zeros(len(problem.fixes)), np.zeros(len(problem.fixes), dtype=bool), 0
@@ -140,8 +140,8 @@ def _predict(problem: Problem, i: int, state: _State, noise: ImuNoise) -> tuple[
 def _transition(R: Array, force: Array, rate: Array, dt: float, noise: ImuNoise) -> tuple[Array, Array]:
     """Transition and process noise of the error over a short step, second order in time."""
     A = np.zeros((15, 15))
-    A[THETA, THETA], A[THETA, BG] = -skew(rate), -np.eye(3)
-    A[V, THETA], A[V, BA] = -R @ skew(force), -R
+    A[THETA, THETA], A[THETA, BG] = -_cross(rate), -np.eye(3)
+    A[V, THETA], A[V, BA] = -R @ _cross(force), -R
     A[P, V] = np.eye(3)
     F = np.eye(15) + A * dt + A @ A * (dt * dt / 2)
     densities = [noise.gyroscope_noise_density, 0.0, noise.accelerometer_noise_density]
@@ -155,7 +155,7 @@ def _update(problem: Problem, state: _State, m: int) -> tuple[_State, float, boo
     from filterpy.kalman import KalmanFilter
 
     kalman = KalmanFilter(dim_x=15, dim_z=3)
-    kalman.H[:, THETA], kalman.H[:, P] = -state.R @ skew(problem.p_imu_antenna), np.eye(3)
+    kalman.H[:, THETA], kalman.H[:, P] = -state.R @ _cross(problem.p_imu_antenna), np.eye(3)
     kalman.R = problem.fixes.covariances[m]
     kalman.P = state.covariance
     innovation = problem.fixes.positions[m] - state.p - state.R @ problem.p_imu_antenna
@@ -174,3 +174,7 @@ def _trajectory(stamps: Array, states: list[_State]) -> Trajectory:
         turn[3:, 3:] = s.R.T
         covariances[i] = turn @ s.covariance[:6, :6] @ turn.T
     return Trajectory(stamps, T, np.array([s.v for s in states]), covariances)
+
+
+def _cross(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

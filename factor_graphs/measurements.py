@@ -6,17 +6,17 @@ them, repair what has one obvious repair, and report every row that they dropped
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.errors import MeasurementError
 from factor_graphs.filled_gaps import filled_in
 from factor_graphs.imu_noise import ImuNoise as ImuNoise
 from factor_graphs.position_covariances import are_correlations, covariances_of
 from factor_graphs.stamps import far_off, gaps
+
+Array = NDArray[np.float64]
 
 # No accelerometer or gyroscope says more, in whatever unit.
 LARGEST_OF_IMU = 1e6
@@ -30,74 +30,68 @@ LEAST_BASELINE_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
-    """Values at `stamps` (n,) s, strictly increasing: a row of each field belongs to a stamp.
+class ImuSamples:
+    """Specific force and angular rate in the imu frame (x forward, y left, z up), each value at its stamp.
 
-    A field has three numbers in a row, one if it is among `of_one`; no row at all is a legal value. Arrays are copied
-    and frozen. Raises MeasurementError for another shape, for a value that is not finite, for stamps out of order, and
-    for standard deviations that are not positive.
+    `stamps` (n,) s, strictly increasing; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s.
+    Raises MeasurementError for another shape, for a value that is not finite, and for stamps out of order.
     """
 
     stamps: Array
-    of_one: ClassVar[tuple[str, ...]] = ("stamps",)
-    of_all: ClassVar[tuple[str, ...]] = ()
-    """Fields that belong to no row: (3,)."""
+    specific_force: Array
+    angular_rate: Array
 
     def __post_init__(self) -> None:
-        for name, given in self._known():
-            array = np.array(given, dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        _check(self)
+        _freeze(self)
+        _check(self, "ImuSamples")
 
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def __getitem__(self, rows: slice | Mask | Rows) -> Self:
-        return replace(
-            self, **{name: array[rows] for name, array in self._known() if name not in self.of_all}
-        )
-
-    def _known(self) -> list[tuple[str, Array]]:
-        values = ((one.name, getattr(self, one.name)) for one in fields(self))
-        return [(name, value) for name, value in values if value is not None]
-
-
-@dataclass(frozen=True, eq=False)
-class ImuSamples(Measurements):
-    """Specific force and angular rate in the imu frame (x forward, y left, z up), each value at its stamp.
-
-    `stamps` (n,) s; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s. Raises MeasurementError as all do.
-    """
-
-    specific_force: Array
-    angular_rate: Array
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "ImuSamples":
+        return ImuSamples(self.stamps[rows], self.specific_force[rows], self.angular_rate[rows])
 
     def at_middle(self) -> "ImuSamples":
         """The same, each at the middle of the usual interval that ends at its stamp: of that it is the mean."""
-        return replace(self, stamps=self.stamps - float(np.median(np.diff(self.stamps))) / 2)
+        earlier = float(np.median(np.diff(self.stamps))) / 2
+        return ImuSamples(self.stamps - earlier, self.specific_force, self.angular_rate)
 
 
 @dataclass(frozen=True, eq=False)
-class GnssFixes(Measurements):
+class GnssFixes:
     """Antenna positions in the map frame with the receiver's own standard deviations.
 
-    `stamps` (m,) s; `positions` (m, 3) m; `stddevs` (m, 3) m; `correlations` (m, 3) of the errors east-north, east-up
-    and north-up, None: not correlated. Raises MeasurementError as all do, and for correlations of no covariance.
+    `stamps` (m,) s, strictly increasing; `positions` (m, 3) m; `stddevs` (m, 3) m, positive; `correlations` (m, 3) of
+    the errors east-north, east-up and north-up, None: not correlated. No fix at all is a legal value. Raises
+    MeasurementError as `ImuSamples` does, for a stddev that is not positive, and for correlations of no covariance.
     """
 
+    stamps: Array
     positions: Array
     stddevs: Array
     correlations: Array | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        _freeze(self)
+        _check(self, "GnssFixes")
+        if np.any(self.stddevs <= 0):
+            row = int(np.argwhere(self.stddevs <= 0)[0, 0])
+            raise MeasurementError(
+                f"GnssFixes.stddevs[{row}] is {self.stddevs[row]} m; expected positive values"
+            )
         if self.correlations is not None and not (possible := are_correlations(self.correlations)).all():
             row = int(np.flatnonzero(~possible)[0])
             raise MeasurementError(
                 f"GnssFixes.correlations[{row}] is {self.correlations[row]}; expected those of a positive definite"
                 " covariance: make them with factor_graphs.position_covariances"
             )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "GnssFixes":
+        correlations = None if self.correlations is None else self.correlations[rows]
+        return GnssFixes(self.stamps[rows], self.positions[rows], self.stddevs[rows], correlations)
 
     @cached_property
     def covariances(self) -> Array:
@@ -113,50 +107,86 @@ class GnssFixes(Measurements):
 
 
 @dataclass(frozen=True, eq=False)
-class WheelSpeeds(Measurements):
+class WheelSpeeds:
     """How fast the wheels roll, each value at its stamp: an odometer, or the speed on the vehicle's bus.
 
-    `stamps` (n,) s; `speeds` (n,) m/s, below zero in reverse if the sensor tells. Raises MeasurementError as all do.
+    `stamps` (n,) s, strictly increasing; `speeds` (n,) m/s, below zero in reverse if the sensor tells. No value at all
+    is legal. Raises MeasurementError as `ImuSamples` does.
     """
 
+    stamps: Array
     speeds: Array
-    of_one: ClassVar[tuple[str, ...]] = ("stamps", "speeds")
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "WheelSpeeds")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
 
 
 @dataclass(frozen=True, eq=False)
-class GnssVelocities(Measurements):
+class GnssVelocities:
     """Velocity of the antenna in the map frame as a receiver measures it, by Doppler or by its filter.
 
-    `stamps` (n,) s on the clock of the fixes; `velocities` (n, 3) m/s; `stddevs` (n, 3) m/s, UNMEASURED for what is not
-    measured: speed and course say nothing of up. Raises MeasurementError as all do.
+    `stamps` (n,) s on the clock of the fixes, strictly increasing; `velocities` (n, 3) m/s; `stddevs` (n, 3) m/s,
+    positive, and UNMEASURED for what is not measured: speed and course say nothing of up. Raises MeasurementError as
+    `GnssFixes` does.
     """
 
+    stamps: Array
     velocities: Array
     stddevs: Array
 
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "GnssVelocities")
+        if np.any(self.stddevs <= 0):
+            row = int(np.argwhere(self.stddevs <= 0)[0, 0])
+            raise MeasurementError(
+                f"GnssVelocities.stddevs[{row}] is {self.stddevs[row]} m/s; expected positive values"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "GnssVelocities":
+        return GnssVelocities(self.stamps[rows], self.velocities[rows], self.stddevs[rows])
+
 
 @dataclass(frozen=True, eq=False)
-class AntennaHeadings(Measurements):
+class AntennaHeadings:
     """Azimuth of the baseline between two antennas of a receiver, clockwise from the map's north.
 
-    `stamps` (n,) s on the clock of the fixes; `azimuths` (n,) rad; `stddevs` (n,) rad; `baseline` (3,) m, from the main
-    antenna to the second one in the imu frame. Raises MeasurementError as all do, and for a baseline that shows no
-    heading: of two antennas that are one, or one above the other.
+    `stamps` (n,) s on the clock of the fixes, strictly increasing; `azimuths` (n,) rad; `stddevs` (n,) rad, positive;
+    `baseline` (3,) m, from the main antenna to the second one in the imu frame. Raises MeasurementError as `GnssFixes`
+    does, and for a baseline that shows no heading: of two antennas that are one, or one above the other.
     """
 
+    stamps: Array
     azimuths: Array
     stddevs: Array
     baseline: Array
-    of_one: ClassVar[tuple[str, ...]] = ("stamps", "azimuths", "stddevs")
-    of_all: ClassVar[tuple[str, ...]] = ("baseline",)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        _freeze(self)
+        _check(self, "AntennaHeadings")
+        if np.any(self.stddevs <= 0):
+            row = int(np.flatnonzero(self.stddevs <= 0)[0])
+            raise MeasurementError(
+                f"AntennaHeadings.stddevs[{row}] is {self.stddevs[row]} rad; expected positive values"
+            )
         if not (level := float(np.linalg.norm(self.baseline[:2]))) >= LEAST_BASELINE_M:
             raise MeasurementError(
                 f"the two antennas are {level:.3f} m apart in the plane of the imu, expected {LEAST_BASELINE_M} m or"
                 " more: p_imu_antenna2 is the place of the second antenna"
             )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "AntennaHeadings":
+        return AntennaHeadings(self.stamps[rows], self.azimuths[rows], self.stddevs[rows], self.baseline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,21 +333,30 @@ def _clean(
     return columns, Repairs(sensor, n, missing, repeated, out_of_order, int(off.sum()), gaps(columns[0]))
 
 
-def _check(value: Measurements) -> None:
-    what, n = type(value).__name__, len(value.stamps) if value.stamps.ndim == 1 else -1
-    for name, array in value._known():
-        expected = (3,) if name in value.of_all else (n,) if name in value.of_one else (n, 3)
+def _freeze(value: "Measurements") -> None:
+    for f in fields(value):
+        if (given := getattr(value, f.name)) is None:
+            continue
+        array = np.array(given, dtype=np.float64)
+        array.setflags(write=False)
+        object.__setattr__(value, f.name, array)
+
+
+def _check(value: "Measurements", what: str) -> None:
+    n = len(value.stamps) if value.stamps.ndim == 1 else -1
+    for f in fields(value):
+        if (array := getattr(value, f.name)) is None:
+            continue
+        of_one = f.name in ("stamps", "speeds", "azimuths") or (
+            f.name == "stddevs" and hasattr(value, "azimuths")
+        )
+        expected = (3,) if f.name == "baseline" else (n,) if of_one else (n, 3)
         if array.shape != expected:
-            raise MeasurementError(f"{what}.{name} has shape {array.shape}; expected {expected}")
-        good = np.isfinite(array)
-        if name == "stddevs":
-            good &= array > 0
-        if not good.all():
-            row = int(np.argwhere(~good)[0, 0])
-            kind = "positive" if name == "stddevs" else "finite"
+            raise MeasurementError(f"{what}.{f.name} has shape {array.shape}; expected {expected}")
+        if not np.isfinite(array).all():
+            row = int(np.argwhere(~np.isfinite(array))[0, 0])
             raise MeasurementError(
-                f"{what}.{name}[{row}] is {array[row]}; expected {kind} values: drop such rows with"
-                " clean_imu/clean_gnss/clean_wheels"
+                f"{what}.{f.name}[{row}] is not finite; drop such rows with clean_imu/clean_gnss/clean_wheels"
             )
     backwards = np.flatnonzero(np.diff(value.stamps) <= 0)
     if len(backwards):
@@ -326,3 +365,6 @@ def _check(value: Measurements) -> None:
             f"{what}.stamps go from {value.stamps[row]} to {value.stamps[row + 1]} s at row {row + 1}; "
             "expected strictly increasing: sort and drop repeats with clean_imu/clean_gnss/clean_wheels"
         )
+
+
+Measurements = ImuSamples | GnssFixes | GnssVelocities | AntennaHeadings | WheelSpeeds

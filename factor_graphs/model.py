@@ -21,13 +21,15 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import NDArray
 
 from factor_graphs.alignment import AttitudePrior
-from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import ImuIntervals
 from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.relative_poses import RelativePoses
+
+Array = NDArray[np.float64]
 
 # GTSAM's own error of integration, m²/s: far below any IMU's, but it keeps short intervals regular.
 INTEGRATION_VARIANCE = 1e-8
@@ -75,7 +77,7 @@ def imu_factors(
 
 def gnss_factors(
     fixes: GnssFixes,
-    keyframes: Rows,
+    keyframes: NDArray[np.intp],
     p_imu_antenna: Array,
     loss: gtsam.noiseModel.mEstimator.Base | None,
 ) -> Iterator[gtsam.GPSFactorArm]:
@@ -94,7 +96,7 @@ def gnss_factors(
 
 def relative_pose_factors(
     relative: RelativePoses,
-    keyframes: Rows,
+    keyframes: NDArray[np.intp],
     loss: gtsam.noiseModel.mEstimator.Base | None,
 ) -> Iterator[gtsam.BetweenFactorPose3]:
     """Every relative pose binds two keyframes, `keyframes` (k, 2)."""
@@ -135,7 +137,7 @@ class BodyVelocities:
     (n, r, 9), and by `by_shared` (n, r, s), what all keyframes share; `stddevs` (n, r) m/s.
     """
 
-    keyframes: Rows
+    keyframes: NDArray[np.intp]
     off: Array
     by_state: Array
     by_shared: Array
@@ -159,7 +161,9 @@ def body_velocity_factors(
     yield gtsam.PriorFactorVector(shared, prior, gtsam.noiseModel.Diagonal.Sigmas(prior_stddevs))
 
 
-def zero_velocity_factors(standing: Mask, stddev_mps: float) -> Iterator[gtsam.PriorFactorVector]:
+def zero_velocity_factors(
+    standing: NDArray[np.bool_], stddev_mps: float
+) -> Iterator[gtsam.PriorFactorVector]:
     """The velocity of every standing keyframe is zero."""
     model = gtsam.noiseModel.Isotropic.Sigma(3, stddev_mps)
     for i in np.flatnonzero(standing).tolist():
@@ -167,7 +171,7 @@ def zero_velocity_factors(standing: Mask, stddev_mps: float) -> Iterator[gtsam.P
 
 
 def zero_motion_factors(
-    resting: Mask, durations: Array, stddev_radps: float, stddev_mps: float
+    resting: NDArray[np.bool_], durations: Array, stddev_radps: float, stddev_mps: float
 ) -> Iterator[gtsam.BetweenFactorPose3]:
     """The pose stays the same in every interval at rest: what the gyroscope says there is its bias.
 
@@ -179,40 +183,21 @@ def zero_motion_factors(
         yield gtsam.BetweenFactorPose3(X(i), X(i + 1), gtsam.Pose3(), model)
 
 
-def skew(v: Array) -> Array:
-    """The matrix (3, 3) of the cross product with v (3,)."""
-    return np.cross(np.eye(3), v)
-
-
 def to_values(T: Array, velocities: Array, biases: Array) -> gtsam.Values:
     """Keyframe states (k, 4, 4), (k, 3), (k, 6) as GTSAM values."""
     values = gtsam.Values()
-    for i, state in enumerate(zip(T, velocities, biases, strict=True)):
-        insert(values, i, *to_gtsam(*state))
+    # named, or the binding tries all kinds of value in turn: 42 µs a bias in place of 10
+    for i, (pose, velocity, bias) in enumerate(zip(T, velocities, biases, strict=True)):
+        values.insert(X(i), pose3=gtsam.Pose3(pose))
+        values.insert(V(i), velocity)
+        values.insert(B(i), constant_bias=gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
     return values
 
 
-def to_gtsam(
-    T: Array, velocity: Array, biases: Array
-) -> tuple[gtsam.Pose3, Array, gtsam.imuBias.ConstantBias]:
-    """The state of one keyframe, (4, 4), (3,), (6,)."""
-    return gtsam.Pose3(T), velocity, gtsam.imuBias.ConstantBias(biases[:3], biases[3:])
-
-
-def insert(
-    values: gtsam.Values, i: int, pose: gtsam.Pose3, velocity: Array, bias: gtsam.imuBias.ConstantBias
-) -> None:
-    """Add the state of keyframe i."""
-    # named, or the binding tries all kinds of value in turn: 42 µs a bias in place of 10
-    values.insert(X(i), pose3=pose)
-    values.insert(V(i), velocity)
-    values.insert(B(i), constant_bias=bias)
-
-
-def from_values(values: gtsam.Values) -> tuple[Array, Array, Array]:
+def from_values(values: gtsam.Values, k: int) -> tuple[Array, Array, Array]:
     """GTSAM values as keyframe states: poses (k, 4, 4), velocities (k, 3), biases (k, 6)."""
     T, velocities = motion_from(values)
-    return T, velocities, np.array([values.atConstantBias(B(i)).vector() for i in range(len(T))])
+    return T, velocities, np.array([values.atConstantBias(B(i)).vector() for i in range(k)])
 
 
 def motion_from(values: gtsam.Values) -> tuple[Array, Array]:

@@ -5,8 +5,9 @@ its standard deviations, and leaves a covariance that is positive definite.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask
+Array = NDArray[np.float64]
 
 # Rows and columns of the correlations east-north, east-up, north-up.
 _PAIRS = np.array([0, 0, 1]), np.array([1, 2, 2])
@@ -23,7 +24,7 @@ def matrices_of(correlations: Array) -> Array:
     return matrices
 
 
-def are_correlations(correlations: Array) -> Mask:
+def are_correlations(correlations: Array) -> NDArray[np.bool_]:
     """Which rows (m,) are of a positive definite matrix; correlations (m, 3) finite."""
     return np.asarray(np.linalg.eigvalsh(matrices_of(correlations))[:, 0] >= LEAST_EIGENVALUE)
 
@@ -34,7 +35,7 @@ def covariances_of(stddevs: Array, correlations: Array | None) -> Array:
     return np.asarray(matrices * stddevs[:, :, None] * stddevs[:, None])
 
 
-def split_covariances(covariances: Array) -> tuple[Array, Array, Mask]:
+def split_covariances(covariances: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Standard deviations (m, 3) m, correlations (m, 3), and which rows (m,) are no covariance: covariances (m, 3, 3).
 
     A matrix that is not symmetric and positive definite is no covariance. Its correlations become zero: what is left of

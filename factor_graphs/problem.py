@@ -6,6 +6,7 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from factor_graphs.alignment import (
     START_POSITION_STDDEV,
@@ -13,16 +14,13 @@ from factor_graphs.alignment import (
     AttitudePrior,
     first_guess,
 )
-from factor_graphs.arrays import Array, Mask, Rows
-from factor_graphs.chi_square import GOOD, HUBER, RARE, mean_below, quantile
-from factor_graphs.elimination import keyframe_covariances
+from factor_graphs.chi_square import probability_below, quantile
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
 from factor_graphs.least_squares import minimise
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.model import (
-    from_values,
     gnss_factors,
     imu_factors,
     motion_from,
@@ -34,9 +32,14 @@ from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import FEWEST, are_new, correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
 
-# Squared whitened residuals that are good, and beyond which they are rejected: of fixes and of relative poses.
-GATE, REJECTION = quantile(GOOD, 3), quantile(RARE, 3)
-RELATIVE_GATE, RELATIVE_REJECTION = quantile(GOOD, 6), quantile(RARE, 6)
+Array = NDArray[np.float64]
+
+# 99 % of good measurements have a squared whitened residual below the first, 99.9 % below the second: fixes ...
+GATE, REJECTION = quantile(0.99, 3), quantile(0.999, 3)
+GOOD_MEAN = 3 * probability_below(GATE, 5) / probability_below(GATE, 3)
+# ... and relative poses.
+RELATIVE_GATE, RELATIVE_REJECTION = quantile(0.99, 6), quantile(0.999, 6)
+RELATIVE_GOOD_MEAN = 6 * probability_below(RELATIVE_GATE, 8) / probability_below(RELATIVE_GATE, 6)
 # A fix so near to a relative pose needs no keyframe of its own, s: it is carried there by velocity. Braking at 3 m/s²
 # moves it by 1 mm; a KITTI unit reports 10 to 23 ms after a scan, so the graph has half of the keyframes.
 CARRIED_S = 0.025
@@ -44,15 +47,17 @@ CARRIED_S = 0.025
 RELATIVE_TOLERANCE, ROUGH = 1e-5, 1e-3
 NOWHERE = np.empty(0)
 
-# The losses of fixes, and of relative poses: a norm of six residuals is larger than one of three.
-LOSSES, RELATIVE_LOSSES = (
-    dict[str, gtsam.noiseModel.mEstimator.Base | None](
-        quadratic=None,
-        huber=gtsam.noiseModel.mEstimator.Huber.Create(quantile(HUBER, dof) ** 0.5),
-        truncated=gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(quantile(RARE, dof) ** 0.5),
-    )
-    for dof in (3, 6)
-)
+LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
+    "quadratic": None,
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create(1.345),
+    "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(REJECTION**0.5),
+}
+# A norm of six residuals is larger than one of three: Huber's loss begins where it leaves the usual.
+RELATIVE_LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
+    "quadratic": None,
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create(quantile(0.8, 6) ** 0.5),
+    "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(RELATIVE_REJECTION**0.5),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +75,13 @@ class Problem:
     p_imu_antenna: Array
     intervals: ImuIntervals
     noise: ImuNoise
-    used: Mask
+    used: NDArray[np.bool_]
     fixes: GnssFixes
-    at: Rows
+    at: NDArray[np.intp]
     late: Array
-    relative_used: Mask
+    relative_used: NDArray[np.bool_]
     relative: RelativePoses
-    relative_at: Rows
+    relative_at: NDArray[np.intp]
     attitude: AttitudePrior
     guess: tuple[Array, Array]
     notes: tuple[str, ...]
@@ -135,16 +140,6 @@ class Fit:
     relative_weights: Array
     chi2_per_dof: float
 
-    @cached_property
-    def states(self) -> tuple[Array, Array, Array]:
-        """Poses (k, 4, 4), velocities (k, 3) and biases (k, 6) of the keyframes."""
-        return from_values(self.values)
-
-    @cached_property
-    def covariances(self) -> Array:
-        """Of (pose tangent, velocity, biases) of the keyframes, (k, 15, 15)."""
-        return keyframe_covariances(self.graph, self.values, len(self.states[0]))[0]
-
 
 def pose_problem(
     imu: ImuSamples,
@@ -194,7 +189,7 @@ def pose_problem(
     )
 
 
-def _near(stamps: Array, others: Array) -> Mask:
+def _near(stamps: Array, others: Array) -> NDArray[np.bool_]:
     """Which of the stamps (m,) have another so near that a fix can be carried there."""
     if not len(others):
         return np.zeros(len(stamps), np.bool_)
@@ -202,7 +197,9 @@ def _near(stamps: Array, others: Array) -> Mask:
     return np.asarray(np.abs(others[nearest(others, stamps)] - stamps) <= CARRIED_S)
 
 
-def usable_fixes(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> tuple[Mask, list[str]]:
+def usable_fixes(
+    fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float
+) -> tuple[NDArray[np.bool_], list[str]]:
     """Which fixes (n,) are new, within the IMU's span, and need no impossible speed; and what to say of the others.
 
     Raises MeasurementError below three.
@@ -312,8 +309,9 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array, known:
     """
     good, relative_good = squares < GATE, relative_squares < RELATIVE_GATE
     total = motion + squares[good].sum() + relative_squares[relative_good].sum()
-    of_one, of_relative = mean_below(GATE, 3), mean_below(RELATIVE_GATE, 6)
-    return float(total / max(of_one * good.sum() + of_relative * relative_good.sum() + known, of_one))
+    return float(
+        total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum() + known, GOOD_MEAN)
+    )
 
 
 def _minimise(

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.errors import MeasurementError
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ class RelativePoses:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def __getitem__(self, rows: slice | Mask | Rows) -> RelativePoses:
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> RelativePoses:
         return RelativePoses(self.stamps[rows], self.T_imu_imu[rows], self.covariances[rows])
 
 

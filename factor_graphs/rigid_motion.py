@@ -6,23 +6,21 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 # Step of the one derivative that is numerical, s: central, so its error is 1e-8 of the third derivative.
 STEP_S = 1e-4
 
 
 class RigidMotion(ABC):
-    """Where the imu is over time, and with what velocity, acceleration and turn rate, all exact.
-
-    By default it is given by `position` and `euler` and their derivatives.
-    """
+    """Where the imu is over time, and with what velocity, acceleration and turn rate, all exact."""
 
     @property
     @abstractmethod
@@ -34,37 +32,21 @@ class RigidMotion(ABC):
     def end(self) -> float:
         """Last stamp, s."""
 
-    def position(self, stamps: ArrayLike, derivative: int = 0) -> Array:
-        """Position in the map frame m, or a derivative of it by time, (k, 3)."""
-        raise NotImplementedError
-
-    def euler(self, stamps: ArrayLike, derivative: int = 0) -> Array:
-        """Yaw, pitch, roll rad (positive pitch: nose down), or their first derivative by time, (k, 3)."""
-        raise NotImplementedError
-
+    @abstractmethod
     def poses(self, stamps: ArrayLike) -> Array:
         """T_map_imu, (k, 4, 4)."""
-        T = np.tile(np.eye(4), (np.size(stamps), 1, 1))
-        T[:, :3, :3] = Rotation.from_euler("ZYX", self.euler(stamps)).as_matrix()
-        T[:, :3, 3] = self.position(stamps)
-        return T
 
+    @abstractmethod
     def velocities(self, stamps: ArrayLike) -> Array:
         """Velocity in the map frame, (k, 3) m/s."""
-        return self.position(stamps, 1)
 
+    @abstractmethod
     def accelerations(self, stamps: ArrayLike) -> Array:
         """Acceleration in the (rotating) map frame, (k, 3) m/s²."""
-        return self.position(stamps, 2)
 
+    @abstractmethod
     def turn_rates(self, stamps: ArrayLike) -> Array:
         """How fast the imu turns in the map frame, about its own axes, (k, 3) rad/s."""
-        (_, pitch, roll), (yaw_rate, pitch_rate, roll_rate) = self.euler(stamps).T, self.euler(stamps, 1).T
-        return np.column_stack([
-            roll_rate - yaw_rate * np.sin(pitch),
-            pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
-            yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll),
-        ])  # fmt: skip
 
     def specific_force(self, stamps: ArrayLike, frame: LocalFrame) -> Array:
         """What a perfect accelerometer reads, (k, 3) m/s², gravity and Coriolis included (Groves 2013)."""
@@ -95,13 +77,16 @@ class Mounted(RigidMotion):
 
     @property
     def start(self) -> float:
+        """First stamp, s."""
         return self.body.start
 
     @property
     def end(self) -> float:
+        """Last stamp, s."""
         return self.body.end
 
     def poses(self, stamps: ArrayLike) -> Array:
+        """T_map_imu, (k, 4, 4)."""
         return self.body.poses(stamps) @ self.T_body_imu
 
     def velocities(self, stamps: ArrayLike) -> Array:
@@ -119,6 +104,7 @@ class Mounted(RigidMotion):
         return self.body.accelerations(stamps) + self._in_map(stamps, in_body)
 
     def turn_rates(self, stamps: ArrayLike) -> Array:
+        """How fast the imu turns in the map frame, about its own axes, (k, 3) rad/s."""
         return self.body.turn_rates(stamps) @ self.T_body_imu[:3, :3]
 
     @property
@@ -134,25 +120,54 @@ class Mounted(RigidMotion):
 class FreeMotion(RigidMotion):
     """Motion of a body that may go where it does not look: splines over time, quintic.
 
-    `way` m, to the map frame; `angles` rad: yaw, pitch, roll. Made by `hand_held` and `drone`.
+    `position` m, to the map frame; `euler` rad: yaw, pitch, roll. Made by `hand_held` and `drone`.
     """
 
-    way: BSpline
-    angles: BSpline
+    position: BSpline
+    euler: BSpline
 
     @property
     def start(self) -> float:
-        return float(self.way.t[0])
+        """First stamp, s."""
+        return float(self.position.t[0])
 
     @property
     def end(self) -> float:
-        return float(self.way.t[-1])
+        """Last stamp, s."""
+        return float(self.position.t[-1])
 
-    def position(self, stamps: ArrayLike, derivative: int = 0) -> Array:
-        return np.asarray(self.way(np.asarray(stamps, np.float64), derivative))
+    def poses(self, stamps: ArrayLike) -> Array:
+        """T_map_imu, (k, 4, 4)."""
+        T = np.tile(np.eye(4), (np.size(stamps), 1, 1))
+        T[:, :3, :3] = Rotation.from_euler("ZYX", _at(self.euler, stamps)).as_matrix()
+        T[:, :3, 3] = _at(self.position, stamps)
+        return T
 
-    def euler(self, stamps: ArrayLike, derivative: int = 0) -> Array:
-        return np.asarray(self.angles(np.asarray(stamps, np.float64), derivative))
+    def velocities(self, stamps: ArrayLike) -> Array:
+        """Velocity in the map frame, (k, 3) m/s."""
+        return _at(self.position, stamps, 1)
+
+    def accelerations(self, stamps: ArrayLike) -> Array:
+        """Acceleration in the (rotating) map frame, (k, 3) m/s²."""
+        return _at(self.position, stamps, 2)
+
+    def turn_rates(self, stamps: ArrayLike) -> Array:
+        """How fast the imu turns in the map frame, about its own axes, (k, 3) rad/s."""
+        return turn_rates(_at(self.euler, stamps), _at(self.euler, stamps, 1))
+
+
+def _at(spline: BSpline, stamps: ArrayLike, derivative: int = 0) -> Array:
+    return np.asarray(spline(np.asarray(stamps, dtype=np.float64), derivative))
+
+
+def turn_rates(euler: Array, change: Array) -> Array:
+    """Turn rate about the axes of the body, (k, 3), of yaw, pitch, roll (k, 3) and their derivatives (k, 3)."""
+    (_, pitch, roll), (yaw_rate, pitch_rate, roll_rate) = euler.T, change.T
+    return np.column_stack([
+        roll_rate - yaw_rate * np.sin(pitch),
+        pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
+        yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll),
+    ])  # fmt: skip
 
 
 def hand_held(seconds: float, rng: np.random.Generator) -> FreeMotion:

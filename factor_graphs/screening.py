@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask, Rows
-from factor_graphs.chi_square import robust_stddev
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from factor_graphs.settings import SmootherSettings
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # However slow the vehicle, two good fixes may differ by this much, m.
 ALLOWANCE_M = 50.0
@@ -21,6 +23,7 @@ DRIFTING_BELOW_S, FILTERED = 0.5, 0.5
 # Fourth differences of white noise have 70 times its variance; those of a vehicle's way, ten times a second, are of
 # millimetres. Steps are even when they differ by no more than this share.
 FOURTH, EVEN = 70.0, 0.1
+MEDIAN_OF_ABS = 0.6745
 
 
 def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
@@ -54,7 +57,7 @@ def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:
     return max((_agreeing(fixes, runs, i, max_speed_mps) for i in longest), key=np.count_nonzero)
 
 
-def _agreeing(fixes: GnssFixes, runs: list[Rows], believed: int, max_speed_mps: float) -> Mask:
+def _agreeing(fixes: GnssFixes, runs: list[NDArray[np.intp]], believed: int, max_speed_mps: float) -> Mask:
     keep = np.zeros(len(fixes), dtype=bool)
     keep[runs[believed]] = True
     for outwards, facing in ((runs[believed + 1 :], 0), (runs[:believed][::-1], -1)):
@@ -88,7 +91,7 @@ def white_share(fixes: GnssFixes) -> float:
     windows = np.lib.stride_tricks.sliding_window_view(steps, 4)
     even = np.ptp(windows, axis=1) < EVEN * windows.mean(axis=1)
     off = (np.diff(fixes.positions[:, :2], 4, axis=0) / fixes.stddevs[2:-2, :2])[even]
-    scatter = robust_stddev(off) if len(off) else 0.0
+    scatter = np.median(np.abs(off)) / MEDIAN_OF_ABS if len(off) else 0.0
     return float(min(scatter / FOURTH**0.5, 1.0))
 
 

@@ -12,7 +12,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array
 from factor_graphs.elimination import (
     OF_KEYFRAME,
     SIZE,
@@ -24,6 +23,8 @@ from factor_graphs.elimination import (
 )
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.model import from_values
+
+Array = NDArray[np.float64]
 
 # The backward solution begins knowing no more than this: rad, m, m/s.
 LOOSE = (1.0, 1e3, 1e2)
@@ -48,7 +49,7 @@ def separation_of(
 ) -> Separation:
     """The separation at k keyframes of a graph at its solution; `noise` tells what is known of biases before."""
     k = len(stamps)
-    T, _, biases = from_values(values)
+    T, _, biases = from_values(values, k)
     linear = graph.linearize(values)
     factors = [linear.at(n) for n in range(linear.size())]
     spans = np.array([_span(factor, k) for factor in factors])

@@ -11,23 +11,25 @@ agrees with the other pairs; and another one beside it says the same.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
-from factor_graphs.arrays import Array, Mask, Rows
-from factor_graphs.chi_square import RARE, huber_weights, quantile
+from factor_graphs.chi_square import quantile
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
 from factor_graphs.elimination import SIZE
 from factor_graphs.errors import EstimationError
-from factor_graphs.trajectory import turned
 
-REJECTION = quantile(RARE, 6)
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# 99.9 % of right pairs lie below, and where the loss of the others begins to grow slower.
+REJECTION, HUBER = quantile(0.999, 6), quantile(0.8, 6)
 # The drives' own covariance is believed up to this factor of a standard deviation when a pair is held against it.
 BELIEVED = 1.5
 # Pairs support each other that are at most so many anchors apart, on both ways.
@@ -50,8 +52,8 @@ class AnchorPairs:
     (p, 6, 6) of the tangent with T Exp(tangent), rotation rad before translation m, in the axes of the second.
     """
 
-    drives: Rows
-    anchors: Rows
+    drives: NDArray[np.intp]
+    anchors: NDArray[np.intp]
     T: Array
     covariances: Array
 
@@ -125,7 +127,7 @@ class _System:
         self._g = np.append(spoken_of.T @ b, np.zeros(len(variances)))
         self.start = np.zeros(len(self._g))
 
-    def columns_of(self, drive: int, anchor: int) -> Rows:
+    def columns_of(self, drive: int, anchor: int) -> NDArray[np.intp]:
         """Where the pose of an anchor stands among the corrections, (6,), and the shift of its drive, (3,)."""
         first, shift = self._first[drive] + SIZE * anchor, len(self._g) + 3 * (drive - len(self.drives))
         return np.append(self._column[first : first + 6], shift + np.arange(3))
@@ -213,17 +215,20 @@ def _tangent(R: Array) -> Array:
     return found
 
 
-def _between(chosen: Rows, covariances: Array, poses: Array) -> Array:
+def _between(chosen: NDArray[np.intp], covariances: Array, poses: Array) -> Array:
     """Covariances of all poses (a, 4, 4) from those (c, 6, 6) of the chosen ones: linear in between, in map axes."""
-    in_map = turned(covariances, poses[chosen, :3, :3])
+    axes = np.zeros((len(poses), 6, 6))
+    axes[:, :3, :3] = axes[:, 3:, 3:] = poses[:, :3, :3]
+    in_map = axes[chosen] @ covariances @ np.swapaxes(axes[chosen], 1, 2)
     places = np.arange(len(poses))
     i = np.clip(np.searchsorted(chosen, places, side="right") - 1, 0, max(len(chosen) - 2, 0))
     after = np.minimum(i + 1, len(chosen) - 1)
     u = ((places - chosen[i]) / np.maximum(chosen[after] - chosen[i], 1))[:, None, None]
-    return turned((1 - u) * in_map[i] + u * in_map[after], np.swapaxes(poses[:, :3, :3], 1, 2))
+    found: Array = np.swapaxes(axes, 1, 2) @ ((1 - u) * in_map[i] + u * in_map[after]) @ axes
+    return found
 
 
-def _stacked(drives: Sequence[CondensedDrive], first: Rows) -> tuple[sparse.csr_array, Array]:
+def _stacked(drives: Sequence[CondensedDrive], first: NDArray[np.intp]) -> tuple[sparse.csr_array, Array]:
     data, row, column, b, count = [], [], [], [], 0
     for start, drive in zip(first, drives, strict=False):
         for part in drive.rows:
@@ -256,7 +261,7 @@ def _expected(system: _System, pairs: AnchorPairs, alone: _State) -> Array:
 def _robust(system: _System, pairs: AnchorPairs, used: Mask, start: _State) -> tuple[_State, Array, Array]:
     """The solution, weights (p,) and squared residuals (p,) of the pairs: Huber's loss first, then truncated."""
     state = start
-    for loss in (partial(huber_weights, dof=6), _truncated):
+    for loss in (_huber, _truncated):
         weights = np.full(len(pairs), -1.0)
         for _ in range(ROUNDS):
             squares = np.sum(system.residuals(pairs, state.poses)[1] ** 2, axis=1)
@@ -265,6 +270,10 @@ def _robust(system: _System, pairs: AnchorPairs, used: Mask, start: _State) -> t
             if np.abs(state.x - x).max(initial=0.0) < STILL and np.allclose(weights, before, atol=0.01):
                 break
     return state, weights, np.sum(system.residuals(pairs, state.poses)[1] ** 2, axis=1)
+
+
+def _huber(squares: Array) -> Array:
+    return np.minimum(1.0, np.sqrt(HUBER / np.maximum(squares, HUBER)))
 
 
 def _truncated(squares: Array) -> Array:
@@ -282,7 +291,7 @@ def _supported(pairs: AnchorPairs, fits: Mask) -> Mask:
     return supported
 
 
-def components(count: int, edges: Rows) -> list[list[int]]:
+def components(count: int, edges: NDArray[np.intp]) -> list[list[int]]:
     """The groups of so many drives that edges (e, 2) connect, directly or by others, each in ascending order."""
     graph = sparse.coo_array((np.ones(len(edges)), tuple(edges.T)), (count, count))
     groups, of_drive = connected_components(graph, directed=False)

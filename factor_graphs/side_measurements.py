@@ -9,14 +9,21 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask, Rows
-from factor_graphs.chi_square import NOTABLE, quantile
-from factor_graphs.imu_noise import HEADING_HOLDS_S
+from factor_graphs.chi_square import quantile
 from factor_graphs.problem import CARRIED_S, Fit, Problem
+
+Array = NDArray[np.float64]
 
 # Seen so often, measurements show what they are.
 FEWEST_SEEN = 10
+# Noise is taken as stated unless it is so many times larger.
+NOTABLE = 1.2
+# Errors that last longer are not looked for: tracking loops and filters of receivers are far shorter.
+LONGEST_ERROR_S = 20.0
+# One good measurement of one number in twenty has Huber's loss.
+HUBER = quantile(0.95, 1) ** 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +39,7 @@ class Observed:
     factors: Callable[[Fit], list[gtsam.NonlinearFactor]] | None = None
     doubtful: bool = False
     turn: float = 0.0
-    points: tuple[Any, Mask] | None = None
+    points: tuple[Any, NDArray[np.bool_]] | None = None
     """Surveyed points with the moments that were found, and which of them are held."""
 
 
@@ -45,8 +52,8 @@ def factors_of(beside: Sequence[Observed], fit: Fit) -> list[gtsam.NonlinearFact
 class Placed:
     """Which of some stamps (n,) have a keyframe: `rows` (r,) of them, its number `at` (r,), and how `late` (r,) s."""
 
-    rows: Rows
-    at: Rows
+    rows: NDArray[np.intp]
+    at: NDArray[np.intp]
     late: Array
 
 
@@ -79,7 +86,7 @@ def _crowd(stamps: Array, off: Array, variance: float, of_solution: float) -> fl
     """
     off, dt = np.clip(off, -3 * variance**0.5, 3 * variance**0.5), float(np.median(np.diff(stamps)))
     crowd = 1.0
-    for lag in range(1, max(2, int(HEADING_HOLDS_S / dt))):
+    for lag in range(1, max(2, int(LONGEST_ERROR_S / dt))):
         whole = stamps[lag:] - stamps[:-lag] < (lag + 0.5) * dt
         products = (off[lag:] * off[:-lag])[whole]
         if products.size < FEWEST_SEEN:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, PchipInterpolator, make_interp_spline
+from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import (
@@ -22,7 +22,9 @@ from factor_graphs.measurements import (
     ImuSamples,
     WheelSpeeds,
 )
-from factor_graphs.rigid_motion import Mounted, RigidMotion
+from factor_graphs.rigid_motion import Mounted, RigidMotion, turn_rates
+
+Array = NDArray[np.float64]
 
 # Suspension: the body rolls and pitches with the way driven, so that it is still when the vehicle is.
 _WAVELENGTHS_M = np.array([[31.0, 13.0], [23.0, 9.0]])
@@ -43,10 +45,12 @@ class Motion(RigidMotion):
 
     @property
     def start(self) -> float:
+        """First stamp, s."""
         return float(self.speed.x[0])
 
     @property
     def end(self) -> float:
+        """Last stamp, s."""
         return float(self.speed.x[-1])
 
     def way(self, stamps: ArrayLike) -> Array:
@@ -59,28 +63,46 @@ class Motion(RigidMotion):
         driven = np.asarray(self.speed.antiderivative()(np.clip(t, self.start, self.end)))
         return np.clip(driven, self.path.t[0], self.path.t[-1])
 
-    def position(self, stamps: ArrayLike, derivative: int = 0) -> Array:
-        s, v = self.way(stamps), self._speed(stamps)
-        if derivative == 0:
-            return np.asarray(self.path(s))
-        if derivative == 1:
-            return self.path(s, 1) * v
-        return self.path(s, 2) * v**2 + self.path(s, 1) * self._speed(stamps, 1)
-
-    def euler(self, stamps: ArrayLike, derivative: int = 0) -> Array:
+    def poses(self, stamps: ArrayLike) -> Array:
+        """T_map_imu, (k, 4, 4)."""
         s = self.way(stamps)
-        (dx, dy, dz), (ddx, ddy, ddz) = self.path(s, 1).T, self.path(s, 2).T
-        level, phase = np.hypot(dx, dy), 2 * np.pi * s[:, None, None] / _WAVELENGTHS_M
-        if derivative == 0:
-            sway = self.suspension * (_SHARES * np.sin(phase)).sum(axis=-1).T
-            return np.column_stack([np.arctan2(dy, dx), -np.arctan2(dz, level) + sway[0], sway[1]])
-        by_way = self.suspension * (_SHARES * np.cos(phase) * 2 * np.pi / _WAVELENGTHS_M).sum(axis=-1).T
-        yaw, rise = (dx * ddy - dy * ddx) / level**2, level * ddz - dz * (dx * ddx + dy * ddy) / level
-        by_way[0] -= rise / (level**2 + dz**2)
-        return np.column_stack([yaw, *by_way]) * self._speed(stamps)
+        T = np.tile(np.eye(4), (len(s), 1, 1))
+        T[:, :3, :3] = self._attitude(s).as_matrix()
+        T[:, :3, 3] = self.path(s)
+        return T
+
+    def velocities(self, stamps: ArrayLike) -> Array:
+        """Velocity in the map frame, (k, 3) m/s."""
+        return self.path(self.way(stamps), 1) * self._speed(stamps)
+
+    def accelerations(self, stamps: ArrayLike) -> Array:
+        """Acceleration in the (rotating) map frame, (k, 3) m/s²."""
+        s, v, a = self.way(stamps), self._speed(stamps), self._speed(stamps, 1)
+        return self.path(s, 2) * v**2 + self.path(s, 1) * a
+
+    def turn_rates(self, stamps: ArrayLike) -> Array:
+        """How fast the body turns in the map frame, about its own axes, (k, 3) rad/s."""
+        euler, by_way = (np.column_stack(angles) for angles in self._euler(self.way(stamps)))
+        return turn_rates(euler, by_way) * self._speed(stamps)
 
     def _speed(self, stamps: ArrayLike, derivative: int = 0) -> Array:
         return np.asarray(self.speed(np.asarray(stamps, dtype=np.float64), derivative))[:, None]
+
+    def _attitude(self, s: Array) -> Rotation:
+        (yaw, pitch, roll), _ = self._euler(s)
+        return Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
+
+    def _euler(self, s: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Yaw, pitch, roll (positive pitch: nose down) and their derivatives by the way."""
+        (dx, dy, dz), (ddx, ddy, ddz) = self.path(s, 1).T, self.path(s, 2).T
+        level = np.hypot(dx, dy)
+        dlevel = (dx * ddx + dy * ddy) / level
+        yaw, yaw_rate = np.arctan2(dy, dx), (dx * ddy - dy * ddx) / level**2
+        pitch, pitch_rate = -np.arctan2(dz, level), -(level * ddz - dz * dlevel) / (level**2 + dz**2)
+        phase = 2 * np.pi * s[:, None, None] / _WAVELENGTHS_M
+        sway = self.suspension * (_SHARES * np.sin(phase)).sum(axis=-1).T
+        sway_rate = self.suspension * (_SHARES * np.cos(phase) * 2 * np.pi / _WAVELENGTHS_M).sum(axis=-1).T
+        return (yaw, pitch + sway[0], sway[1]), (yaw_rate, pitch_rate + sway_rate[0], sway_rate[1])
 
 
 def follow(waypoints: ArrayLike, stamps: ArrayLike, speeds: ArrayLike, suspension_deg: float = 0.0) -> Motion:

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array
-from factor_graphs.chi_square import NEVER_ZERO, ROUNDS, huber_weights, probability_below, robust_stddev
-from factor_graphs.imu_noise import HEADING_HOLDS_S
+from factor_graphs.chi_square import probability_below
+
+Array = NDArray[np.float64]
 
 # At first, slip is not believed to be less, m/s, for as long, s: a fifth of what a car on a road shows sideways. Once
 # the constraint is held, its residuals say more (`slip_variance.py`).
@@ -15,11 +16,11 @@ LEAST_SLIP, LEAST_LASTING_S = 0.02, 1.0
 BLOCK_S = 10.0
 # Keyframes are as far apart as this, s, in an outage: slip that changes faster is seen there as it is sampled.
 SPARSE_S = 1.0
-# Where squares are cut, in standard deviations; what a cut leaves of a normal variance.
-CUT = 2.5
+# The heading of a solution drifts, and looks like slip; over this time, s, it does not.
+DRIFT_S = 20.0
+# Huber's loss of the fit, and where squares are cut, in standard deviations; what a cut leaves of a normal variance.
+HUBER, CUT, ROUNDS = 1.345, 2.5, 10
 LEFT = probability_below(CUT**2, 3) + CUT**2 * (1 - probability_below(CUT**2, 1))
-# A skid is so many times less certain than it is fast.
-SKID = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +43,6 @@ class Slip:
         return np.asarray(np.sqrt(grows_with @ self.parts * together), np.float64)
 
 
-UNSEEN = Slip(np.array([0.01, 0.0, 0.0]), LEAST_LASTING_S, 0.1)
-"""Of what was not seen to slide."""
-
-
 def explain(
     y: Array,
     by: Array,
@@ -56,8 +53,8 @@ def explain(
 ) -> tuple[Array, Slip, Array]:
     """The x (n,) of y = by x + slip, and the slip: each from the other in turn (iteratively reweighted least squares).
 
-    Third, what is neither (k,) m/s: a skid, zero where there is none. The mean slope of every window is taken for drift
-    of heading. Where the constraint holds the heading, slip that lasts longer hides in it; counted as slip, it
+    Third, what is neither (k,) m/s: a skid, zero where there is none. The mean slope of every `DRIFT_S` s is taken for
+    drift of heading. Where the constraint holds the heading, slip that lasts longer hides in it; counted as slip, it
     would loosen the constraint wherever clock or axes are a little wrong: 5.1 m in place of 4.1 m in the outages of a
     real log.
 
@@ -67,17 +64,17 @@ def explain(
     from scipy.optimize import nnls  # takes 0.2 s to import; a drive with LiDAR does without
 
     x: Array = np.zeros(len(stddevs))
-    window = (np.cumsum(spacing) / HEADING_HOLDS_S).astype(int)
+    window = (np.cumsum(spacing) / DRIFT_S).astype(int)
     left, drift, parts = y, np.zeros(window[-1] + 1), np.zeros(3)
     variance: Array = np.full(len(y), max(robust_stddev(y), LEAST_SLIP) ** 2)
     for _ in range(ROUNDS):
-        weights = spacing * huber_weights((y - by @ x) ** 2 / variance, 1) / variance
+        weights = spacing * _huber(y - by @ x, variance)
         information = (by.T * weights) @ by + np.diag(stddevs**-2)
         x = np.linalg.inv(information) @ (by.T * weights) @ y
         left = y - by @ x - drift[window] * ahead
-        weights = huber_weights(left**2 / variance, 1) / variance
+        weights = _huber(left, variance)
         lever = np.bincount(window, weights * ahead**2)
-        drift = drift + np.bincount(window, weights * left * ahead) / np.maximum(lever, NEVER_ZERO)
+        drift = drift + np.bincount(window, weights * left * ahead) / np.maximum(lever, 1e-12)
         left, most = y - by @ x - drift[window] * ahead, CUT * np.sqrt(variance)
         scale = np.sqrt(spacing) / variance
         parts = nnls(grows_with * scale[:, None], np.clip(left, -most, most) ** 2 / LEFT * scale)[0]
@@ -88,6 +85,17 @@ def explain(
     lasting = max(_lasting(np.clip(off, -CUT, CUT), spacing), LEAST_LASTING_S * (LEAST_SLIP / typical) ** 2)
     slip = Slip(parts, lasting, typical)
     return x, slip, np.where(np.abs(off) > CUT, left, 0.0)
+
+
+def _huber(off: Array, variance: Array) -> Array:
+    """Weights of values under Huber's loss."""
+    weights: Array = np.minimum(1.0, HUBER * np.sqrt(variance) / np.maximum(np.abs(off), 1e-12)) / variance
+    return weights
+
+
+def robust_stddev(values: Array) -> float:
+    """The standard deviation about zero of normal values, whatever a few others are (median absolute deviation)."""
+    return 1.4826 * float(np.median(np.abs(values)))
 
 
 def _lasting(values: Array, spacing: Array) -> float:

@@ -8,58 +8,25 @@ solution takes of it, and both are known. Their ratio to what is seen corrects t
 from dataclasses import dataclass, replace
 
 import numpy as np
-from gtsam.symbol_shorthand import M
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Rows
-from factor_graphs.chi_square import MOST_CHANGE, NEVER_ZERO, NOTABLE
-from factor_graphs.elimination import SIZE, Places, keyframe_covariances
-from factor_graphs.imu_noise import HEADING_HOLDS_S
+from factor_graphs.covariances import SumVariance, keyframe_covariances
+from factor_graphs.elimination import SIZE
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.slip import BLOCK_S, CUT, LEFT, Slip
+from factor_graphs.slip import BLOCK_S, CUT, DRIFT_S, LEFT, Slip
 from factor_graphs.vehicle import Vehicle, body_motion, where_seen
+
+Array = NDArray[np.float64]
 
 # Blocks in a window over which drift of heading is taken from what is seen sideways; of pitch, gravity tells. The means
 # of each block are sideways and vertical.
-BLOCKS, AXES = round(HEADING_HOLDS_S / BLOCK_S), 2
+BLOCKS, AXES = round(DRIFT_S / BLOCK_S), 2
 # With fewer blocks nothing is changed. A solution is taken to leave at least this share of the slip.
 LEAST_BLOCKS, LEAST_SHARE = 12, 0.2
 # Density that is never gone below, m/s/√Hz: 0.05° of the direction of travel at 6 m/s, for a second.
 LEAST_DENSITY = 0.005
-
-
-class SumVariance:
-    """Variance of sums of G x over the keyframes of a window, and of G s of what all keyframes share.
-
-    `rows` (k, m, 15) are G of every keyframe and `windows` (k,) its window, -1 for none; `of_shared` (w, m, 5) are G of
-    the mounting. `found` (w, m) is known once `keyframe_covariances` has gone through all keyframes.
-    """
-
-    def __init__(self, rows: Array, windows: Rows, of_shared: Array) -> None:
-        self.found = np.zeros(of_shared.shape[:2])
-        self._rows, self._windows, self._of_shared = rows, windows, of_shared
-        self._first = {int(w): int(i) for i, w in reversed(list(enumerate(windows))) if w >= 0}
-        self._sum = np.zeros((rows.shape[1], rows.shape[1]))
-        self._beside = np.empty((0, rows.shape[1]))
-        """Covariance of the keyframes known, in their order, and the sum."""
-
-    def add(self, i: int, W: Array, rows: Rows, joint: Array, known: Places) -> None:
-        later = self._beside[rows] if len(self._beside) else np.zeros((len(rows), len(self._sum)))
-        own, window = -W @ later, int(self._windows[i])
-        if window >= 0:
-            G = self._rows[i]
-            both = G @ own
-            self._sum += G @ joint[:SIZE, :SIZE] @ G.T + both + both.T
-            own, later = own + joint[:SIZE, :SIZE] @ G.T, later + joint[SIZE:, :SIZE] @ G.T
-        self._beside = np.vstack([own, later])
-        if window >= 0 and self._first[window] == i:
-            self._finish(window, joint, known)
-
-    def _finish(self, window: int, joint: Array, known: Places) -> None:
-        G, place = self._of_shared[window], known[M(len(self._windows))]
-        both = G @ self._beside[place]
-        total = self._sum + G @ joint[np.ix_(place, place)] @ G.T + both + both.T
-        self.found[window] = total.diagonal()
-        self._sum[:], self._beside = 0.0, np.empty((0, len(self._sum)))
+# Found, a density is good enough when it would change by less than the first; its square grows by the second at most.
+ENOUGH, MOST = 1.2, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +65,7 @@ def slip_sums(problem: Problem, fit: Fit, vehicle: Vehicle) -> SlipSums | None:
     own[np.arange(len(where)), block] = spacing
     leaning, lever = np.zeros((count, BLOCKS)), np.bincount(window, ahead**2)
     np.add.at(leaning, window, own * ahead[:, None])
-    straight = own - (leaning / np.maximum(lever, NEVER_ZERO)[:, None])[window] * ahead[:, None]
+    straight = own - (leaning / np.maximum(lever, 1e-12)[:, None])[window] * ahead[:, None]
     share = np.stack([straight, own], axis=2)
 
     def summed(values: Array) -> Array:
@@ -134,8 +101,8 @@ def corrected(slip: tuple[Slip, Slip], sums: SlipSums) -> tuple[Slip, Slip]:
     share, ratio = left / of_slip, squares / left
     more, less = 1 + (ratio - 1) / share, ratio ** (1 / share)
     found = []
-    for one, change in zip(slip, np.where(ratio > 1, np.minimum(more, MOST_CHANGE), less), strict=True):
+    for one, change in zip(slip, np.where(ratio > 1, np.minimum(more, MOST), less), strict=True):
         lasting_s = max(one.lasting_s * float(change), (LEAST_DENSITY / one.typical) ** 2)
-        is_as_believed = 1 / NOTABLE < np.sqrt(lasting_s / one.lasting_s) < NOTABLE
+        is_as_believed = 1 / ENOUGH < np.sqrt(lasting_s / one.lasting_s) < ENOUGH
         found.append(one if is_as_believed else replace(one, lasting_s=lasting_s))
     return found[0], found[1]

@@ -5,25 +5,23 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.antenna_heading import observe_headings
-from factor_graphs.arrays import Array, Mask
 from factor_graphs.calibration import Calibration, in_order, scale_error, upright_axis
-from factor_graphs.chi_square import ROUNDS
 from factor_graphs.clock_check import checked, stamps_are_ends
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.consistent_fixes import with_consistent_fixes
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
 from factor_graphs.doubts import correlation, doubts
-from factor_graphs.elimination import keyframe_covariances
 from factor_graphs.errors import MeasurementError
 from factor_graphs.fitting import (
     calibrate,
     fit_noise,
+    fit_noise_by_components,
     reject,
-    with_noise_shown,
 )
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.gnss_velocity import observe_velocities
@@ -39,6 +37,7 @@ from factor_graphs.measurements import (
     WheelSpeeds,
     measured,
 )
+from factor_graphs.model import from_values
 from factor_graphs.problem import (
     NOWHERE,
     REJECTION,
@@ -60,9 +59,11 @@ from factor_graphs.surveyed_points import (
     residuals_of,
 )
 from factor_graphs.trajectory import Trajectory
-from factor_graphs.variance import ImuResiduals, imu_noise_shown
+from factor_graphs.variance import BiasSteps, imu_noise_shown
 from factor_graphs.vehicle import Vehicle
 from factor_graphs.wheels import Wheels
+
+Array = NDArray[np.float64]
 
 Also = GnssVelocities | AntennaHeadings | SurveyedPoints
 """What may be known beside IMU and fixes."""
@@ -71,6 +72,8 @@ Also = GnssVelocities | AntennaHeadings | SurveyedPoints
 HALF = 0.5
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
+# The scale of the gyroscope is corrected so many times at most: the first time, the noise of the IMU is not right yet.
+SCALE_ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +101,9 @@ class Solution:
     state_covariances: Array
     fix_weights: Array
     fix_residuals: Array
-    rejected: Mask
+    rejected: NDArray[np.bool_]
     relative_weights: Array
-    relative_rejected: Mask
+    relative_rejected: NDArray[np.bool_]
     chi2_per_dof: float
     inflation: float
     fix_inflation: float
@@ -116,7 +119,7 @@ class Solution:
     separation: Separation | None = None
 
     @property
-    def outside_imu(self) -> Mask:
+    def outside_imu(self) -> NDArray[np.bool_]:
         """Which of the fixes given (m,) are of a time without IMU: not used, and `rejected` for no fault of theirs."""
         return np.asarray(np.isnan(self.fix_residuals[:, 0]))
 
@@ -155,7 +158,7 @@ def smooth(
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
     inertial = _Inertial.of(imu, fixes, settings)
     log = _Log(fixes, frame, settings, given, initial_attitude, relative, wheels, also)
-    for _ in range(ROUNDS):
+    for _ in range(SCALE_ROUNDS):
         problem, held, calibration, beside, inertial = log.solved(inertial)
         is_asked = calibration.scale_in_question and not problem.is_bound
         scale = scale_error(problem, held.fit) if is_asked else 0.0
@@ -299,21 +302,15 @@ def _constrained(
     everything is held again.
     """
     may_inflate = problem.settings.inflate_imu_noise and len(problem.relative) == 0
-    by_fixes = fit
+    by_fixes, k = fit, len(problem.intervals.keyframes)
     for is_last in (not may_inflate, True):
         held = hold_beside(problem, by_fixes, beside)
         fit, constraints, vehicle, wheels = constrain(problem, held, speeds, beside)
-        fit = reject(problem, fit, constraints)
-        if is_last:
-            k = len(problem.intervals.keyframes)
-            covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k)
+        fit, steps = reject(problem, fit, constraints), BiasSteps(k)
+        covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k, None if is_last else steps)
+        if is_last or imu_noise_shown(problem, fit, covariances, steps) == (fit.inflation, fit.of_walk):
             break
-        shown = ImuResiduals(problem, fit)
-        covariances, of_shared = shown.covariances, shown.of_shared
-        if imu_noise_shown(fit, shown) == (fit.inflation, fit.of_walk):
-            break
-        # a vehicle constraint hides noise: an axle that slides less than believed has small residuals
-        _, by_fixes = with_noise_shown(problem, by_fixes)
+        by_fixes = fit_noise_by_components(problem, by_fixes)
     return _Constrained(fit, vehicle, wheels, covariances, of_shared)
 
 
@@ -338,7 +335,7 @@ def _observe(one: Also, problem: Problem, fit: Fit, calibration: Calibration) ->
 
 def _solution(problem: Problem, held: _Constrained, fixes: GnssFixes, calibration: Calibration) -> Solution:
     fit, vehicle, wheels, covariances = held.fit, held.vehicle, held.wheels, held.covariances
-    T, velocities, biases = fit.states
+    T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
     shared_stddevs = np.sqrt(held.of_shared.diagonal())
     if vehicle is not None and vehicle.held:
         vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:5])

@@ -1,8 +1,9 @@
 """Stamps of a sensor, s: which are of another drive, whether they are seconds, and where they have gaps."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask
+Array = NDArray[np.float64]
 
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 # A longer step than so many usual ones is a gap: where one row is lost it is of two, with some jitter.
@@ -11,7 +12,7 @@ LONGEST_STEP = 2.5
 BREAK_S, DAY_S, FEW = 600.0, 86_400.0, 0.01
 
 
-def far_off(stamps: Array) -> Mask:
+def far_off(stamps: Array) -> NDArray[np.bool_]:
     """Which stamps (n,) s, finite, in any order, are not of the same drive as most: (n,).
 
     Between groups are breaks of ten minutes. A group is far off the largest one when it has a hundredth of its

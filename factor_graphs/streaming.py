@@ -10,17 +10,18 @@ from typing import SupportsFloat, SupportsIndex, SupportsInt
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from factor_graphs.arrays import Array
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import SAME_STAMP_S, ImuIntervals, split
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from factor_graphs.model import gnss_factors, imu_factors, insert, relative_pose_factors, to_gtsam
+from factor_graphs.model import gnss_factors, imu_factors, relative_pose_factors
 from factor_graphs.problem import LOSSES, RELATIVE_LOSSES
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.smoothing import Solution
+
+Array = NDArray[np.float64]
 
 # iSAM2 relinearises what moved by more than the threshold, at every tenth update.
 RELINEARIZE_SKIP, RELINEARIZE_THRESHOLD = 10, 0.1
@@ -109,30 +110,40 @@ class StreamingSmoother:
         params.setRelinearizeThreshold(RELINEARIZE_THRESHOLD)
         self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s, params)
         i, state = self._keyframe, self.state
-        models = map(gtsam.noiseModel.Gaussian.Covariance, self._covariances)
-        pose, velocity, bias = to_gtsam(state.T_map_imu, state.velocity, state.biases)
+        of_pose, of_velocity, of_bias = map(gtsam.noiseModel.Gaussian.Covariance, self._covariances)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.push_back(gtsam.PriorFactorPose3(X(i), pose, next(models)))
-        graph.push_back(gtsam.PriorFactorVector(V(i), velocity, next(models)))
-        graph.push_back(gtsam.PriorFactorConstantBias(B(i), bias, next(models)))
-        insert(values, i, pose, velocity, bias)
+        pose, bias = (
+            gtsam.Pose3(state.T_map_imu),
+            gtsam.imuBias.ConstantBias(state.biases[:3], state.biases[3:]),
+        )
+        graph.push_back(gtsam.PriorFactorPose3(X(i), pose, of_pose))
+        graph.push_back(gtsam.PriorFactorVector(V(i), state.velocity, of_velocity))
+        graph.push_back(gtsam.PriorFactorConstantBias(B(i), bias, of_bias))
+        values.insert(X(i), pose3=pose)
+        values.insert(V(i), state.velocity)
+        values.insert(B(i), constant_bias=bias)
         self._smoother.update(graph, values, dict.fromkeys((X(i), V(i), B(i)), state.stamp))
         self._keyframe_stamps = {i: state.stamp}
 
     def _extend(self, intervals: ImuIntervals, fix: GnssFixes, relative: RelativePoses) -> None:
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        stamps = dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]()
+        graph, values, stamps = (
+            gtsam.NonlinearFactorGraph(),
+            gtsam.Values(),
+            dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex](),
+        )
         first = self._keyframe
         last = first + len(intervals.keyframes) - 1
-        *navigation, bias = to_gtsam(self.state.T_map_imu, self.state.velocity, self.state.biases)
-        ahead = gtsam.NavState(*navigation)
+        bias = gtsam.imuBias.ConstantBias(self.state.biases[:3], self.state.biases[3:])
+        ahead = gtsam.NavState(gtsam.Pose3(self.state.T_map_imu), self.state.velocity)
         here = np.tile(self.state.T_map_imu[:3, 3], (last - first, 1))
         for i, factor in enumerate(
             imu_factors(intervals, intervals.noise(self._noise), self._frame, here, first), first + 1
         ):
             graph.push_back(factor)
             ahead = factor.preintegratedMeasurements().predict(ahead, bias)
-            insert(values, i, ahead.pose(), ahead.velocity(), bias)
+            values.insert(X(i), pose3=ahead.pose())
+            values.insert(V(i), ahead.velocity())
+            values.insert(B(i), constant_bias=bias)
             stamps |= {key: float(intervals.keyframes[i - first]) for key in (X(i), V(i), B(i))}
         known = self._keyframe_stamps | dict(enumerate(intervals.keyframes.tolist(), first))
         at = np.array([_keyframe_at(known, stamp) for stamp in relative.stamps.ravel()], dtype=int).reshape(

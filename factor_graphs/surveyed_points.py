@@ -10,16 +10,20 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from factor_graphs.arrays import Array, Mask, Rows
-from factor_graphs.at_rest import STANDING_SPEED
 from factor_graphs.chi_square import BEYOND_DOUBT
+from factor_graphs.constraints import STANDING_SPEED
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.model import from_values
 from factor_graphs.problem import CARRIED_S, Fit, Problem
 from factor_graphs.side_measurements import Observed
 from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 # A point fits where neither its nor the solution's standard deviations leave a doubt, per axis, and this, m.
 LEAST_FITTING_M = 0.1
@@ -44,7 +48,7 @@ class SurveyedPoints:
     positions: Array
     stddevs: Array
     stamps: Array
-    control: Mask
+    control: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.positions).all() and (self.stddevs > 0).all()):
@@ -130,8 +134,9 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit) -> Observ
     off = _off(points, problem, fit, at, late)
     fits = np.zeros(len(points), np.bool_)
     if len(there):
-        R = fit.states[0][at[there], :3, :3]
-        of_place = np.einsum("kij,kjl,kil->ki", R, fit.covariances[at[there], 3:6, 3:6], R)
+        covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
+        R = from_values(fit.values, len(covariances))[0][at[there], :3, :3]
+        of_place = np.einsum("kij,kjl,kil->ki", R, covariances[at[there], 3:6, 3:6], R)
         limits = BEYOND_DOUBT * np.sqrt(of_place + points.stddevs[there] ** 2) + LEAST_FITTING_M
         fits[there] = (np.abs(off[there]) < limits).all(axis=1)
     held = points.control & fits
@@ -155,7 +160,7 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit) -> Observ
 
 def residuals_of(
     known: SurveyedPoints,
-    held: Mask,
+    held: NDArray[np.bool_],
     keyframes: Trajectory,
     p_imu_antenna: Array,
 ) -> tuple[PointResidual, ...]:
@@ -171,10 +176,12 @@ def residuals_of(
     return tuple(rows)
 
 
-def _keyframes(points: SurveyedPoints, problem: Problem, fit: Fit, stamps: Array) -> tuple[Rows, Array]:
+def _keyframes(
+    points: SurveyedPoints, problem: Problem, fit: Fit, stamps: Array
+) -> tuple[NDArray[np.intp], Array]:
     """The keyframe (n,) of every point, -1 for none, and how late (n,) s it was there."""
     keyframes = problem.intervals.keyframes
-    velocities = fit.states[1]
+    velocities = from_values(fit.values, len(keyframes))[1]
     antennas = _antennas(problem, fit)
     stands = np.flatnonzero(np.linalg.norm(velocities, axis=1) < STANDING_SPEED)
     at, late = np.full(len(points), -1), np.zeros(len(points))
@@ -192,17 +199,17 @@ def _keyframes(points: SurveyedPoints, problem: Problem, fit: Fit, stamps: Array
 
 def _antennas(problem: Problem, fit: Fit) -> Array:
     """Where the antenna was at the keyframes, (k, 3) m."""
-    T = fit.states[0]
+    T = from_values(fit.values, len(problem.intervals.keyframes))[0]
     return np.asarray(T[:, :3, 3] + T[:, :3, :3] @ problem.p_imu_antenna)
 
 
-def _off(points: SurveyedPoints, problem: Problem, fit: Fit, at: Rows, late: Array) -> Array:
+def _off(points: SurveyedPoints, problem: Problem, fit: Fit, at: NDArray[np.intp], late: Array) -> Array:
     """Estimated less surveyed, (n, 3) m; at keyframe -1 of no meaning."""
-    velocities = fit.states[1]
+    velocities = from_values(fit.values, len(problem.intervals.keyframes))[1]
     return np.asarray(_antennas(problem, fit)[at] + velocities[at] * late[:, None] - points.positions)
 
 
-def _mistake(points: SurveyedPoints, off: Array, unfit: Rows, n: int) -> str:
+def _mistake(points: SurveyedPoints, off: Array, unfit: NDArray[np.intp], n: int) -> str:
     """What points that do not fit are, of n."""
     names = ", ".join(points.names[k] for k in unfit[:5])
     if len(unfit) < 2 or 2 * len(unfit) < n:
@@ -224,13 +231,13 @@ def _mistake(points: SurveyedPoints, off: Array, unfit: Rows, n: int) -> str:
 def _factors(
     known: SurveyedPoints,
     problem: Problem,
-    rows: Rows,
-    at: Rows,
+    rows: NDArray[np.intp],
+    at: NDArray[np.intp],
     late: Array,
     fit: Fit,
 ) -> list[gtsam.NonlinearFactor]:
     """Every control point that is held holds the antenna of its keyframe."""
-    velocities = fit.states[1]
+    velocities = from_values(fit.values, len(problem.intervals.keyframes))[1]
     places = known.positions - velocities[at] * late[:, None]
     return [
         gtsam.GPSFactorArm(

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array, Mask, Rows
 from factor_graphs.errors import MeasurementError
+
+Array = NDArray[np.float64]
 
 TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _UPPER = np.triu_indices(6)
@@ -73,7 +74,7 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def __getitem__(self, rows: slice | Rows | Mask) -> "Trajectory":
+    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> "Trajectory":
         """Some of the poses, in order of time and at least one."""
         velocities, covariances = (
             None if each is None else each[rows] for each in (self.velocities, self.covariances)
@@ -136,7 +137,7 @@ class Trajectory:
         T[:, 3, 3] = 1.0
         return T
 
-    def _moved(self, i: Rows, u: Array, segments: _Segments) -> Array:
+    def _moved(self, i: NDArray[np.intp], u: Array, segments: _Segments) -> Array:
         """How far from knots i (j,) the imu is at shares u (j, 1) of the segments after them, (j, 3) m."""
         step, h = segments.step[i], segments.duration[i, None]
         if self.velocities is None:
@@ -214,14 +215,6 @@ class Trajectory:
                 f"{path}: no column {error.args[0]} beside the others of its kind"
             ) from None
         return Trajectory(stamps, T, velocities, covariances)
-
-
-def turned(covariances: Array, R: Array) -> Array:
-    """Covariances (n, 6, 6) of rotation and translation, both seen in axes turned by R (n, 3, 3)."""
-    both = np.zeros_like(covariances)
-    both[:, :3, :3] = both[:, 3:, 3:] = R
-    back = np.swapaxes(both, 1, 2).copy()  # NumPy takes twice as long for a view
-    return np.asarray(both @ covariances @ back, np.float64)
 
 
 def _columns(path: Path) -> dict[str, Array]:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import GnssFixes
@@ -12,6 +13,7 @@ from factor_graphs.smoothing import Solution, heading_stddevs
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+Array = NDArray[np.float64]
 
 AXES = ("east", "north", "up")
 COLOURS = ("tab:red", "tab:green", "tab:blue")

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.arrays import Array
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 
@@ -37,6 +37,6 @@ def write_covariance_tum(trajectory: Trajectory, file: Path | str | BinaryIO) ->
     np.savetxt(file, np.hstack([_tum_rows(trajectory), lower]), fmt=[*TUM_FORMAT, *["%.8g"] * 21])
 
 
-def _tum_rows(trajectory: Trajectory) -> Array:
+def _tum_rows(trajectory: Trajectory) -> NDArray[np.float64]:
     quat_xyzw = Rotation.from_matrix(trajectory.T_map_imu[:, :3, :3]).as_quat(canonical=True)
     return np.column_stack([trajectory.stamps, trajectory.positions, quat_xyzw])

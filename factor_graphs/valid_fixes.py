@@ -1,10 +1,12 @@
 """Valid fixes of a receiver: a position on Earth, an accuracy, and no jump that a vehicle cannot make."""
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from factor_graphs.arrays import Array, Mask
 from factor_graphs.geodesy import FLATTENING, SEMI_MAJOR_AXIS
+
+Array = NDArray[np.float64]
 
 LEAST_STDDEV_M, LARGEST_STDDEV_M = 1e-4, 1e5
 LARGEST_ALT_M = 1e5
@@ -13,7 +15,7 @@ JUMP_M, FASTEST_M_S = 20_000.0, 150.0
 NEIGHBOURS = 21
 
 
-def valid_fixes(stamps: Array, geodetic: Array, stddevs: Array) -> tuple[Mask, dict[str, int]]:
+def valid_fixes(stamps: Array, geodetic: Array, stddevs: Array) -> tuple[NDArray[np.bool_], dict[str, int]]:
     """Mask (n,) of the rows that are valid fixes, and the number of invalid rows of each kind.
 
     `stamps` (n,) s, finite; `geodetic` (n, 3) degrees and m; `stddevs` (n, 3) m.
@@ -50,7 +52,7 @@ def _other_angles(lat: Array, lon: Array) -> str:
     return "; are these degrees and minutes, 4903.5 for 49° 3.5'? write degrees" if is_nmea else ""
 
 
-def _near(stamps: Array, geodetic: Array) -> Mask:
+def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:
     """Mask of the fixes close to their neighbours in time; of positions too far apart, the group with most fixes is
     kept.
     """

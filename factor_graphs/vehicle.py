@@ -7,19 +7,17 @@ and c the angle at which tyres roll under lateral acceleration v_x w_z.
 Going backwards changes the sign of v_x and nothing else.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import M
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask
-from factor_graphs.chi_square import robust_stddev
 from factor_graphs.intervals import nearest
-from factor_graphs.model import BodyVelocities, body_velocity_factors
+from factor_graphs.model import from_values
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.slip import SKID, UNSEEN, Slip, explain
+from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
+
+Array = NDArray[np.float64]
 
 # Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s², height m
 MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0, 0.01, 2.0])
@@ -31,6 +29,10 @@ MOVING_SPEED, LEAST_TIME_S, LEAST_WAY_M = 2.0, 30.0, 200.0
 MOST_SLIP, MOST_SLOPE = 0.04, 0.3
 # Farther than this from a fix, s, a solution is too uncertain to show slip.
 BESIDE_S = 2.0
+# Slip, m/s, of what was not seen to slide.
+UNSEEN_SLIP = 0.1
+# A skid is so many times less certain than it is fast.
+SKID = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class BodyMotion:
         """About the imu's z axis, (k,) rad/s."""
         return np.asarray(self.rates[:, 2])
 
-    def __getitem__(self, rows: Mask) -> "BodyMotion":
+    def __getitem__(self, rows: NDArray[np.bool_]) -> "BodyMotion":
         return BodyMotion(self.R_imu_map[rows], self.velocity[rows], self.rates[rows], self.spacing[rows])
 
     def sliding(self, mounting: Array) -> Array:
@@ -157,7 +159,7 @@ class Vehicle:
 def body_motion(problem: Problem, fit: Fit) -> BodyMotion:
     """The motion at the keyframes of a solution."""
     stamps = problem.intervals.keyframes
-    T, velocities, biases = fit.states
+    T, velocities, biases = from_values(fit.values, len(stamps))
     R_imu_map = np.swapaxes(T[:, :3, :3], 1, 2)
     in_imu = (R_imu_map @ velocities[:, :, None])[:, :, 0]
     return BodyMotion(R_imu_map, in_imu, problem.intervals.rates - biases[:, 3:], np.gradient(stamps))
@@ -167,8 +169,11 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
     where = where_seen(problem, fit, motion)
     seen, skids = motion[where], np.zeros((len(where), 2))
-    if doubt := too_seldom("it is seen to move", np.linalg.norm(seen.velocity, axis=1), seen.spacing):
-        return Vehicle(np.zeros(5), (UNSEEN, UNSEEN), skids, doubt)
+    time, way = seen.spacing.sum(), np.linalg.norm(seen.velocity, axis=1) @ seen.spacing
+    if time < LEAST_TIME_S or way < LEAST_WAY_M:
+        unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
+        doubt = f"it is seen to move for {time:.0f} s and {way:.0f} m only"
+        return Vehicle(np.zeros(5), (unseen, unseen), skids, doubt)
     mounting, by_mounting, slip = np.zeros(5), seen.by_mounting(), []
     for row, part in enumerate((SIDEWAYS, UPWARDS)):
         known = by_mounting[:, row] @ mounting
@@ -184,12 +189,6 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     return Vehicle(mounting, (slip[0], slip[1]), skids, _doubt(mounting, seen))
 
 
-def too_seldom(seen: str, speeds: Array, spacing: Array) -> str:
-    """In words, that what is `seen` lasts too short or leads not far enough; empty where it does not."""
-    time, way = spacing.sum(), speeds @ spacing
-    return f"{seen} for {time:.0f} s and {way:.0f} m only" if time < LEAST_TIME_S or way < LEAST_WAY_M else ""
-
-
 def _doubt(mounting: Array, motion: BodyMotion) -> str:
     """Why what moves is no vehicle that rolls on wheels; empty when it is."""
     if np.abs(mounting[:2]).max() > MOST_SLOPE:
@@ -201,20 +200,20 @@ def _doubt(mounting: Array, motion: BodyMotion) -> str:
     return ""
 
 
-def where_seen(problem: Problem, fit: Fit, motion: BodyMotion) -> Mask:
+def where_seen(problem: Problem, fit: Fit, motion: BodyMotion) -> NDArray[np.bool_]:
     """The keyframes (k,) at which slip is seen: moving, and beside a fix that fits."""
     moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
     return np.asarray(moving & beside_fixes(problem, fit))
 
 
-def beside_fixes(problem: Problem, fit: Fit) -> Mask:
+def beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     """The keyframes (k,) beside a fix that fits, not in an outage: no farther than fixes usually are apart."""
     stamps = problem.intervals.keyframes
     good = stamps[problem.at[fit.weights > 0.5]]
     if len(good) < 2:
         return np.zeros(len(stamps), dtype=bool)
     distance = np.abs(good[nearest(good, stamps)] - stamps)
-    beside: Mask = distance <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
+    beside: NDArray[np.bool_] = distance <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
     return beside
 
 
@@ -222,17 +221,3 @@ def direction(mounting: Array) -> Array:
     """The direction of travel in the imu's axes, (3,), by the slopes that the mounting (5,) begins with."""
     slopes = np.array([1.0, mounting[0], mounting[1]])
     return np.asarray(slopes / np.linalg.norm(slopes))
-
-
-def non_holonomic_factors(
-    values: gtsam.Values, motion: BodyMotion, stddevs: Array
-) -> Iterator[gtsam.NonlinearFactor]:
-    """The axle slides by `stddevs` (k, 2) m/s, lateral and vertical, linearised at `values`, which `motion` is of.
-
-    The mounting, M(k), is one unknown of all rows, and has a prior.
-    """
-    k = len(stddevs)
-    mounting = values.atVector(M(k))
-    by_state = motion.by_state(motion.by_velocity(mounting))
-    known = BodyVelocities(np.arange(k), motion.sliding(mounting), by_state, -motion.by_mounting(), stddevs)
-    return body_velocity_factors(values, known, M(k), np.zeros(5), MOUNTING_STDDEVS)

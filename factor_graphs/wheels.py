@@ -11,20 +11,29 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import W
+from numpy.typing import NDArray
 
-from factor_graphs.arrays import Array, Mask
-from factor_graphs.chi_square import NEVER_ZERO, ROUNDS, robust_stddev
-from factor_graphs.imu_noise import HEADING_HOLDS_S
 from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.slip import SKID, UNSEEN, Slip, explain
-from factor_graphs.vehicle import MOVING_SPEED, BodyMotion, beside_fixes, direction, too_seldom
+from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
+from factor_graphs.vehicle import (
+    LEAST_TIME_S,
+    LEAST_WAY_M,
+    MOVING_SPEED,
+    UNSEEN_SLIP,
+    BodyMotion,
+    beside_fixes,
+    direction,
+)
+from factor_graphs.wheel_readings import Readings, read
+
+Array = NDArray[np.float64]
 
 # Before anything is seen: scale, offset m/s, latency s, and how far left the imu is m.
 UNKNOWN, STDDEVS = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.3, 0.5, 0.2, 1.0])
-# No latency is beyond this, s.
-MOST_LATENCY_S = 1.0
+# Latency is found by so many corrections, none beyond this, s.
+LATENCY_ROUNDS, MOST_LATENCY_S = 3, 1.0
 # What differs from the speed by more than this share is no wheel, nor is one whose scale is beyond these.
 MOST_MISFIT, SCALES = 0.1, (0.8, 1.25)
 # How much m/s one unit is.
@@ -36,90 +45,15 @@ UNITS = {
     "0.01 km/h": 0.01 / 3.6,
     "0.1 km/h": 0.1 / 3.6,
 }
-# A wheel slips where it is so many standard deviations off.
-SLIPPING = 3.5
-# Without fixes a solution drifts: slip is then what differs from the median of a window. Where more than a share of it
-# slips, all of it does: wheels that are frozen agree with the speed now and then.
-MOST_SLIP = 1 / 3
+# A wheel slips where it is so many standard deviations off; it is so many times less certain than it is fast.
+CUT, SKID = 3.5, 3.0
+# Without fixes a solution drifts: slip is then what differs from the median of so long, s. Where more than a share of
+# that time slips, all of it does: wheels that are frozen agree with the speed now and then.
+DRIFT_S, MOST_SLIP = 20.0, 1 / 3
 # Once wheels hold it, it drifts no longer than this, s.
 HELD_S = 1.0
 # A wheel said to be at rest may creep, m/s; it is one value for so long, s.
 CREEP, CREEP_S = 0.2, 10.0
-# A keyframe takes the samples within this, s, or within so many usual steps of a slow sensor, but no farther than that.
-WINDOW_S, STEPS, FARTHEST_S = 0.15, 1.2, 1.5
-# Below this, m/s, sensors are blind or say zero, and a vehicle may turn back; above that one, it does not stand.
-BLIND_SPEED, ROLLING_SPEED = 0.5, 0.1
-# A way between two stops leads where the solution says, when that agrees with this share of the wheels' own.
-SURE_WAY = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """Wheel speeds at k keyframes, without sign: `speeds` (k,) m/s, their `changes` (k,) m/s².
-
-    `rolling` (k,): they say a speed; `stopped` (k,): they say zero; where neither holds, they say nothing but that they
-    are `moving` (k,).
-    `directions` (k,): 1 or -1, what the speed is to be multiplied with; 0 where they say none.
-    """
-
-    speeds: Array
-    changes: Array
-    rolling: Mask
-    stopped: Mask
-    moving: Mask
-    directions: Array
-
-    def grows_with(self) -> Array:
-        """What the variance of slip grows with: nothing, speed squared, acceleration squared, (k, 3)."""
-        return np.column_stack([np.ones(len(self.speeds)), self.speeds**2, self.changes**2])
-
-
-def read(wheels: WheelSpeeds, stamps: Array, ahead: Array) -> Readings:
-    """The wheels at keyframes: a straight line through the samples around each of `stamps` (k,) s.
-
-    Its errors are less than a sample's, and there are no more of them than keyframes. `ahead` (k,) m/s is the forward
-    speed of a solution: many sensors do not tell forwards from backwards.
-    """
-    k, reach = len(stamps), WINDOW_S
-    if len(wheels) > 1:
-        reach = float(np.clip(STEPS * np.median(np.diff(wheels.stamps)), WINDOW_S, FARTHEST_S))
-    first = np.searchsorted(wheels.stamps, stamps - reach)
-    count = np.searchsorted(wheels.stamps, stamps + reach, side="right") - first
-    row = np.repeat(np.arange(k), count)
-    sample = np.arange(len(row)) + np.repeat(first - np.cumsum(count) + count, count)
-    t, w = wheels.stamps[sample] - stamps[row], wheels.speeds[sample]
-    n, t1, t2, w1, tw, before, after, slow, still, zero = (
-        np.bincount(row, values, k)
-        for values in (
-            np.ones(len(t)), t, t * t, w, t * w, t <= 0, t >= 0,
-            np.abs(w) < BLIND_SPEED, np.abs(w) < ROLLING_SPEED, w == 0,
-        )
-    )  # fmt: skip
-    spread = n * t2 - t1**2
-    known = (before > 0) & (after > 0) & (spread > 1e-9)
-    changes = np.where(known, (n * tw - t1 * w1) / np.where(known, spread, 1.0), 0.0)
-    speeds = np.where(known, (w1 - changes * t1) / np.maximum(n, 1.0), 0.0)
-    rolling = known & (slow == 0)
-    sign = np.where(speeds < 0, -1.0, 1.0)
-    directions = sign * rolling
-    if len(wheels) and wheels.speeds.min() > -BLIND_SPEED:
-        directions = _directions(wheels, stamps, speeds, rolling, ahead)
-    rolling, stopped, moving = directions != 0, known & (zero == n), known & (still == 0)
-    return Readings(sign * speeds, sign * changes, rolling, stopped, moving, directions)
-
-
-def _directions(wheels: WheelSpeeds, stamps: Array, speeds: Array, rolling: Mask, ahead: Array) -> Array:
-    """Forwards 1, backwards -1, unknown 0, (k,): one for all from stop to stop, where alone a vehicle turns back."""
-    found = np.zeros(len(stamps))
-    if not rolling.any():
-        return found
-    slow = wheels.stamps[np.abs(wheels.speeds) < BLIND_SPEED]
-    _, way = np.unique(np.searchsorted(slow, stamps[rolling]), return_inverse=True)
-    v, w = ahead[rolling], speeds[rolling]
-    alike = np.bincount(way, v * w) / np.bincount(way, w * w)
-    sure = np.abs(alike) > SURE_WAY * np.median(np.abs(v / w))
-    found[rolling] = np.where(sure, np.sign(alike), 0.0)[way]
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +133,15 @@ def observe_wheels(
     """
     stamps, ahead = problem.intervals.keyframes, motion.ahead(mounting)
     calibration, beside = UNKNOWN if known is None else known, beside_fixes(problem, fit)
-    for step in range(ROUNDS if known is None else 1):
+    for step in range(LATENCY_ROUNDS if known is None else 1):
         readings = read(wheels, stamps + calibration[2], ahead)
         where = readings.rolling & beside & (np.abs(ahead) > MOVING_SPEED)
         spacing = motion.spacing[where]
-        if doubt := too_seldom("beside fixes they are seen to roll", np.abs(ahead[where]), spacing):
-            return Wheels(readings, calibration, UNSEEN, np.zeros(len(stamps)), doubt=doubt)
+        time, way = spacing.sum(), np.abs(ahead[where]) @ spacing
+        if time < LEAST_TIME_S or way < LEAST_WAY_M:
+            unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
+            doubt = f"beside fixes they are seen to roll for {time:.0f} s and {way:.0f} m only"
+            return Wheels(readings, calibration, unseen, np.zeros(len(stamps)), doubt=doubt)
         if known is None and step == 0:  # in whatever unit
             ratios = (ahead * readings.directions)[where] / readings.speeds[where]
             calibration = np.array([np.median(ratios), 0.0, 0.0, 0.0])
@@ -223,11 +160,13 @@ def observe_wheels(
     seen = Wheels(readings, calibration, noise, np.zeros(len(stamps)))
     doubt = _doubt(seen, misfit(ahead, motion.yaw_rate, readings, calibration)[0][where], ahead[where])
     density = problem.noise.accelerometer_noise_density * fit.inflation
-    drift = float(density * np.sqrt(HEADING_HOLDS_S if known is None else HELD_S))
+    drift = float(density * np.sqrt(DRIFT_S if known is None else HELD_S))
     return replace(_with_slip(seen, ahead, motion, beside, drift), doubt=doubt)
 
 
-def _with_slip(wheels: Wheels, ahead: Array, motion: BodyMotion, beside: Mask, drift: float) -> Wheels:
+def _with_slip(
+    wheels: Wheels, ahead: Array, motion: BodyMotion, beside: NDArray[np.bool_], drift: float
+) -> Wheels:
     """The same wheels with what does not fit, also where no fix is: there a solution drifts, but slowly.
 
     `drift` m/s is how far it may be off its median.
@@ -235,20 +174,20 @@ def _with_slip(wheels: Wheels, ahead: Array, motion: BodyMotion, beside: Mask, d
     readings = wheels.readings
     off, _ = misfit(ahead, motion.yaw_rate, readings, wheels.calibration)
     said = readings.rolling | readings.stopped
-    window = (np.cumsum(motion.spacing) / HEADING_HOLDS_S).astype(int)
+    window = (np.cumsum(motion.spacing) / DRIFT_S).astype(int)
     lost = said & ~beside
     for part in np.unique(window[lost]):
         off[lost & (window == part)] -= np.median(off[said & (window == part)])
     stddevs = np.sqrt(readings.grows_with() @ wheels.noise.parts)
     stddevs[readings.stopped] = CREEP
     stddevs[lost] = np.hypot(stddevs[lost], drift)
-    slips = said & (np.abs(off) > SLIPPING * stddevs)
+    slips = said & (np.abs(off) > CUT * stddevs)
     slip = np.where(slips, off, 0.0)
     for part in np.unique(window[slips]):
         its = said & (window == part)
         if slips[its].mean() > MOST_SLIP:
             slip[its] = np.sqrt(np.mean(off[its] ** 2))
-    share = motion.spacing[slip != 0].sum() / max(motion.spacing[said].sum(), NEVER_ZERO)
+    share = motion.spacing[slip != 0].sum() / max(motion.spacing[said].sum(), 1e-12)
     return replace(wheels, slip=slip, slip_share=float(share))
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.arrays import Complex
-from factor_graphs.dead_reckoning import WINDOW_S, Windows, agreement, way_of, windows_of
+from factor_graphs.dead_reckoning import WINDOW_S, Complex, Windows, agreement, way_of, windows_of
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from gnss_sem_map.preflight.inertial_sums import SmoothedIntegral
 from gnss_sem_map.preflight.response import turn_gain

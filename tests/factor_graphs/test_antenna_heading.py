@@ -45,7 +45,7 @@ def test_the_jacobian_is_that_of_the_azimuth_and_exact_headings_cost_nothing(sim
     factors = observed.factors(fit)
     costs = [factor.error(fit.values) for factor in factors]
     assert np.sqrt(2 * np.max(costs)) * np.degrees(STDDEV) < 0.2  # degrees: the solution without them
-    T, v, biases = from_values(fit.values)
+    T, v, biases = from_values(fit.values, len(problem.intervals.keyframes))
     turned = T.copy()
     turned[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec([2e-4, -1e-4, 3e-4]).as_matrix()
     values = to_values(turned, v, biases)

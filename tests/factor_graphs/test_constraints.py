@@ -5,14 +5,14 @@ from gtsam.symbol_shorthand import M, V, X
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import errors
-from factor_graphs.at_rest import creeping, quiet_intervals, resting, standing
+from factor_graphs.constraints import creeping, non_holonomic_factors, quiet_intervals, resting, standing
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import split
 from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import Motion, follow
 from factor_graphs.smoothing import smooth
-from factor_graphs.vehicle import BodyMotion, non_holonomic_factors
+from factor_graphs.vehicle import BodyMotion
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)
 LEVER = np.array([0.5, 0.3, 1.0])

@@ -2,7 +2,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, M, V, X
 
-from factor_graphs.elimination import keyframe_covariances
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.held_constraints import constrain

@@ -48,7 +48,7 @@ def test_undamped_steps_find_the_least_cost(held):
     assert_least(graph, found)
     again, fewer = minimise(graph, found, False, 100, 1e-5)
     assert iterations > fewer == 1
-    for one, other in zip(from_values(found), from_values(again), strict=True):
+    for one, other in zip(from_values(found, k), from_values(again, k), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 

@@ -83,8 +83,8 @@ def test_wheel_speeds_are_of_one_column_in_order_and_may_be_none():
     [
         ([0.0, 1.0, 1.0, 2.0], ZEROS, "strictly increasing"),
         ([0.0, 1.0, 0.5, 2.0], ZEROS, "strictly increasing"),
-        ([0.0, 1.0, np.nan, 2.0], ZEROS, r"stamps"),
-        ([0.0, 1.0, 2.0, 3.0], np.full((4, 3), np.inf), r"specific_force"),
+        ([0.0, 1.0, np.nan, 2.0], ZEROS, r"stamps\[2\] is not finite"),
+        ([0.0, 1.0, 2.0, 3.0], np.full((4, 3), np.inf), r"specific_force\[0\] is not finite"),
         ([0.0, 1.0, 2.0], ZEROS, r"expected \(3, 3\)"),
     ],
 )

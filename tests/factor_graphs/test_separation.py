@@ -70,7 +70,7 @@ def test_it_is_that_of_dense_solutions_of_both_parts_of_the_graph(bound: Problem
     linear = fit.graph.linearize(fit.values)
     factors = [linear.at(n) for n in range(linear.size())]
     numbers = [{split_key(key)[1] for key in list(factor.keys())} for factor in factors]
-    T, _, biases = from_values(fit.values)
+    T, _, biases = from_values(fit.values, len(stamps))
     noise, last = problem.noise, len(stamps) - 1
     stddevs = np.repeat([*LOOSE, noise.accelerometer_bias_stddev, noise.gyroscope_bias_stddev], 3)
     end = last, np.concatenate([np.zeros(9), -biases[-1]]), stddevs

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.accuracy import errors
 from factor_graphs.chi_square import quantile
 from factor_graphs.condensing import CondensedDrive
-from factor_graphs.elimination import SIZE
+from factor_graphs.covariances import SIZE
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.relative_poses import RelativePoses

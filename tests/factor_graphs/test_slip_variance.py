@@ -8,7 +8,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.elimination import SIZE, keyframe_covariances
+from factor_graphs.covariances import SIZE, SumVariance, keyframe_covariances
 from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.held_constraints import constrain
@@ -17,7 +17,6 @@ from factor_graphs.problem import pose_problem
 from factor_graphs.rigid_motion import FreeMotion
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import random_drive
-from factor_graphs.slip_variance import SumVariance
 from factor_graphs.smoothing import smooth
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)

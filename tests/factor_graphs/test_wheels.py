@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import errors, nees
 from factor_graphs.chi_square import quantile
-from factor_graphs.elimination import keyframe_covariances
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.held_constraints import constrain
@@ -20,7 +20,8 @@ from factor_graphs.simulation import Motion, follow, random_drive, simulate_whee
 from factor_graphs.slip import Slip
 from factor_graphs.smoothing import smooth
 from factor_graphs.vehicle import BodyMotion
-from factor_graphs.wheels import Wheels, misfit, read, wheel_factors
+from factor_graphs.wheel_readings import read
+from factor_graphs.wheels import Wheels, misfit, wheel_factors
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)
 LEVER = np.array([0.5, 0.3, 1.0])

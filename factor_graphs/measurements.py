@@ -6,6 +6,7 @@ them, repair what has one obvious repair, and report every row that they dropped
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,35 +31,76 @@ LEAST_BASELINE_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class ImuSamples:
+class _Rows:
+    """Arrays with a row for each stamp, frozen and checked: (n, 3), the `_flat` ones (n,), and the `_fixed` one (3,).
+
+    Raises MeasurementError for another shape, a value that is not finite, stamps out of order, or stddevs, in `_unit`,
+    that are not positive.
+    """
+
+    stamps: Array
+
+    _flat: ClassVar[tuple[str, ...]] = ("stamps", "speeds", "azimuths")
+    _fixed: ClassVar[str] = "baseline"
+    _unit: ClassVar[str] = "m"
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if (given := getattr(self, f.name)) is not None:
+                array = np.array(given, dtype=np.float64)
+                array.setflags(write=False)
+                object.__setattr__(self, f.name, array)
+        for f in fields(self):
+            self._check(f.name, getattr(self, f.name))
+        what, backwards = type(self).__name__, np.flatnonzero(np.diff(self.stamps) <= 0)
+        if len(backwards):
+            row = int(backwards[0])
+            raise MeasurementError(
+                f"{what}.stamps go from {self.stamps[row]} to {self.stamps[row + 1]} s at row {row + 1}; expected"
+                " strictly increasing: sort and drop repeats with clean_imu/clean_gnss/clean_wheels"
+            )
+        stddevs = getattr(self, "stddevs", np.ones(1))
+        if np.any(stddevs <= 0):
+            row = int(np.argwhere(stddevs <= 0)[0, 0])
+            raise MeasurementError(f"{what}.stddevs[{row}] is {stddevs[row]} {self._unit}; expected positive")
+
+    def _check(self, name: str, array: Array | None) -> None:
+        n = len(self.stamps) if self.stamps.ndim == 1 else -1
+        expected = (3,) if name == self._fixed else (n,) if name in self._flat else (n, 3)
+        what = f"{type(self).__name__}.{name}"
+        if array is not None and array.shape != expected:
+            raise MeasurementError(f"{what} has shape {array.shape}; expected {expected}")
+        if array is not None and not np.isfinite(array).all():
+            row = int(np.argwhere(~np.isfinite(array))[0, 0])
+            raise MeasurementError(f"{what}[{row}] is not finite; drop such rows with clean_imu, clean_gnss")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Self:
+        given = {f.name: getattr(self, f.name) for f in fields(self) if f.name != self._fixed}
+        return replace(self, **{name: array[rows] for name, array in given.items() if array is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples(_Rows):
     """Specific force and angular rate in the imu frame (x forward, y left, z up), each value at its stamp.
 
     `stamps` (n,) s, strictly increasing; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s.
     Raises MeasurementError for another shape, for a value that is not finite, and for stamps out of order.
     """
 
-    stamps: Array
     specific_force: Array
     angular_rate: Array
-
-    def __post_init__(self) -> None:
-        _freeze(self)
-        _check(self, "ImuSamples")
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "ImuSamples":
-        return ImuSamples(self.stamps[rows], self.specific_force[rows], self.angular_rate[rows])
 
     def at_middle(self) -> "ImuSamples":
         """The same, each at the middle of the usual interval that ends at its stamp: of that it is the mean."""
         earlier = float(np.median(np.diff(self.stamps))) / 2
-        return ImuSamples(self.stamps - earlier, self.specific_force, self.angular_rate)
+        return replace(self, stamps=self.stamps - earlier)
 
 
 @dataclass(frozen=True, eq=False)
-class GnssFixes:
+class GnssFixes(_Rows):
     """Antenna positions in the map frame with the receiver's own standard deviations.
 
     `stamps` (m,) s, strictly increasing; `positions` (m, 3) m; `stddevs` (m, 3) m, positive; `correlations` (m, 3) of
@@ -66,32 +108,18 @@ class GnssFixes:
     MeasurementError as `ImuSamples` does, for a stddev that is not positive, and for correlations of no covariance.
     """
 
-    stamps: Array
     positions: Array
     stddevs: Array
     correlations: Array | None = None
 
     def __post_init__(self) -> None:
-        _freeze(self)
-        _check(self, "GnssFixes")
-        if np.any(self.stddevs <= 0):
-            row = int(np.argwhere(self.stddevs <= 0)[0, 0])
-            raise MeasurementError(
-                f"GnssFixes.stddevs[{row}] is {self.stddevs[row]} m; expected positive values"
-            )
+        super().__post_init__()
         if self.correlations is not None and not (possible := are_correlations(self.correlations)).all():
             row = int(np.flatnonzero(~possible)[0])
             raise MeasurementError(
                 f"GnssFixes.correlations[{row}] is {self.correlations[row]}; expected those of a positive definite"
                 " covariance: make them with factor_graphs.position_covariances"
             )
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "GnssFixes":
-        correlations = None if self.correlations is None else self.correlations[rows]
-        return GnssFixes(self.stamps[rows], self.positions[rows], self.stddevs[rows], correlations)
 
     @cached_property
     def covariances(self) -> Array:
@@ -107,26 +135,18 @@ class GnssFixes:
 
 
 @dataclass(frozen=True, eq=False)
-class WheelSpeeds:
+class WheelSpeeds(_Rows):
     """How fast the wheels roll, each value at its stamp: an odometer, or the speed on the vehicle's bus.
 
     `stamps` (n,) s, strictly increasing; `speeds` (n,) m/s, below zero in reverse if the sensor tells. No value at all
     is legal. Raises MeasurementError as `ImuSamples` does.
     """
 
-    stamps: Array
     speeds: Array
-
-    def __post_init__(self) -> None:
-        _freeze(self)
-        _check(self, "WheelSpeeds")
-
-    def __len__(self) -> int:
-        return len(self.stamps)
 
 
 @dataclass(frozen=True, eq=False)
-class GnssVelocities:
+class GnssVelocities(_Rows):
     """Velocity of the antenna in the map frame as a receiver measures it, by Doppler or by its filter.
 
     `stamps` (n,) s on the clock of the fixes, strictly increasing; `velocities` (n, 3) m/s; `stddevs` (n, 3) m/s,
@@ -134,28 +154,14 @@ class GnssVelocities:
     `GnssFixes` does.
     """
 
-    stamps: Array
     velocities: Array
     stddevs: Array
 
-    def __post_init__(self) -> None:
-        _freeze(self)
-        _check(self, "GnssVelocities")
-        if np.any(self.stddevs <= 0):
-            row = int(np.argwhere(self.stddevs <= 0)[0, 0])
-            raise MeasurementError(
-                f"GnssVelocities.stddevs[{row}] is {self.stddevs[row]} m/s; expected positive values"
-            )
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "GnssVelocities":
-        return GnssVelocities(self.stamps[rows], self.velocities[rows], self.stddevs[rows])
+    _unit: ClassVar[str] = "m/s"
 
 
 @dataclass(frozen=True, eq=False)
-class AntennaHeadings:
+class AntennaHeadings(_Rows):
     """Azimuth of the baseline between two antennas of a receiver, clockwise from the map's north.
 
     `stamps` (n,) s on the clock of the fixes, strictly increasing; `azimuths` (n,) rad; `stddevs` (n,) rad, positive;
@@ -163,30 +169,20 @@ class AntennaHeadings:
     does, and for a baseline that shows no heading: of two antennas that are one, or one above the other.
     """
 
-    stamps: Array
     azimuths: Array
     stddevs: Array
     baseline: Array
 
+    _flat: ClassVar[tuple[str, ...]] = ("stamps", "azimuths", "stddevs")
+    _unit: ClassVar[str] = "rad"
+
     def __post_init__(self) -> None:
-        _freeze(self)
-        _check(self, "AntennaHeadings")
-        if np.any(self.stddevs <= 0):
-            row = int(np.flatnonzero(self.stddevs <= 0)[0])
-            raise MeasurementError(
-                f"AntennaHeadings.stddevs[{row}] is {self.stddevs[row]} rad; expected positive values"
-            )
+        super().__post_init__()
         if not (level := float(np.linalg.norm(self.baseline[:2]))) >= LEAST_BASELINE_M:
             raise MeasurementError(
                 f"the two antennas are {level:.3f} m apart in the plane of the imu, expected {LEAST_BASELINE_M} m or"
                 " more: p_imu_antenna2 is the place of the second antenna"
             )
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "AntennaHeadings":
-        return AntennaHeadings(self.stamps[rows], self.azimuths[rows], self.stddevs[rows], self.baseline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,40 +327,3 @@ def _clean(
     columns = [c[first] for c in columns]
     missing = int(n - np.count_nonzero(finite))
     return columns, Repairs(sensor, n, missing, repeated, out_of_order, int(off.sum()), gaps(columns[0]))
-
-
-def _freeze(value: "Measurements") -> None:
-    for f in fields(value):
-        if (given := getattr(value, f.name)) is None:
-            continue
-        array = np.array(given, dtype=np.float64)
-        array.setflags(write=False)
-        object.__setattr__(value, f.name, array)
-
-
-def _check(value: "Measurements", what: str) -> None:
-    n = len(value.stamps) if value.stamps.ndim == 1 else -1
-    for f in fields(value):
-        if (array := getattr(value, f.name)) is None:
-            continue
-        of_one = f.name in ("stamps", "speeds", "azimuths") or (
-            f.name == "stddevs" and hasattr(value, "azimuths")
-        )
-        expected = (3,) if f.name == "baseline" else (n,) if of_one else (n, 3)
-        if array.shape != expected:
-            raise MeasurementError(f"{what}.{f.name} has shape {array.shape}; expected {expected}")
-        if not np.isfinite(array).all():
-            row = int(np.argwhere(~np.isfinite(array))[0, 0])
-            raise MeasurementError(
-                f"{what}.{f.name}[{row}] is not finite; drop such rows with clean_imu/clean_gnss/clean_wheels"
-            )
-    backwards = np.flatnonzero(np.diff(value.stamps) <= 0)
-    if len(backwards):
-        row = int(backwards[0])
-        raise MeasurementError(
-            f"{what}.stamps go from {value.stamps[row]} to {value.stamps[row + 1]} s at row {row + 1}; "
-            "expected strictly increasing: sort and drop repeats with clean_imu/clean_gnss/clean_wheels"
-        )
-
-
-Measurements = ImuSamples | GnssFixes | GnssVelocities | AntennaHeadings | WheelSpeeds

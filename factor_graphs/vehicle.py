@@ -172,7 +172,7 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     time, way = seen.spacing.sum(), np.linalg.norm(seen.velocity, axis=1) @ seen.spacing
     if time < LEAST_TIME_S or way < LEAST_WAY_M:
         unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
-        doubt = f"it is seen to move for {time:.0f} s and {way:.0f} m only"
+        doubt = f"it is seen to move faster than {MOVING_SPEED:g} m/s for {time:.0f} s and {way:.0f} m only"
         return Vehicle(np.zeros(5), (unseen, unseen), skids, doubt)
     mounting, by_mounting, slip = np.zeros(5), seen.by_mounting(), []
     for row, part in enumerate((SIDEWAYS, UPWARDS)):

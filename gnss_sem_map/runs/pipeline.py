@@ -225,7 +225,7 @@ def map_log(
     log: SensorLog, segmenter: Segmenter | None, run: MapJob, labels_from: str = "", force: bool = False
 ) -> MappedLog:
     """Map a log that is open, with a segmenter that is open, as a map of one; see `drive_tasks.finish`."""
-    job = job_for(Source(log.name, labels_from, called=Path(log.name).name), run, force)
+    job = job_for(Source(log.name, labels_from or None, called=Path(log.name).name), run, force)
     with closing_drives():
         give(job, log, segmenter)
         bound_and_mapped([job], run)

@@ -78,7 +78,7 @@ class ThinnedSweeps:
 
     def _save(self, number: int, points: Points) -> None:
         """It is no loss where it cannot be saved: the sweep is read again."""
-        if self.folder is None or number not in self.numbers:
+        if self.folder is None or number not in self.numbers or not self.folder.is_dir():
             return
         arrays = {"rows": points.rows.reshape(-1, 4)}
         with suppress(DataError):

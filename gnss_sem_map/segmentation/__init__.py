@@ -158,5 +158,6 @@ def _needs(scheme: str, spec: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        way = how_to_install(EXTRAS[scheme])
+        extra = EXTRAS[scheme]
+        way = how_to_install(extra)
         raise ConfigError(f"segmenter {spec!r}: {error.name} is not installed; {way}") from None

@@ -123,7 +123,7 @@ def test_a_dry_run_without_scans_ends_as_the_run_does(small_drive: Street, tmp_p
     run, dry = gnss_sem_map(*words), gnss_sem_map(*words, "--dry-run")
     assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
     assert run.returncode == 1
-    assert "has no LiDAR scan to map" in dry.stderr
+    assert "has no LiDAR scan" in dry.stderr
 
 
 def test_a_dry_run_counts_on_a_damaged_scan_being_skipped(small_drive: Street, tmp_path: Path) -> None:

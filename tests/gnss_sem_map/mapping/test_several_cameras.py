@@ -226,7 +226,7 @@ def test_findings_name_their_camera(surround: Path, small_drive: Street) -> None
         ({"T_camera_lidar": FRONT["T_camera_lidar"]}, "expected one of T_camera_lidar and T_imu_camera"),
         (
             {"distortion": {"model": "fisheye", "coefficients": [0.1]}},
-            "found 1 coefficients, expected 4 for fisheye",
+            "found 1 coefficients, not 4: fisheye",
         ),
         (
             {"distortion": {"model": "wide", "coefficients": [0.1]}},

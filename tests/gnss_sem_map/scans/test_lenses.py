@@ -145,7 +145,7 @@ def test_a_lens_sees_as_far_as_its_polynomial_rises() -> None:
 
 
 def test_lenses_of_other_shapes_are_refused() -> None:
-    with pytest.raises(ValidationError, match="found 3 coefficients, expected 4 or 5 or 8 for brown"):
+    with pytest.raises(ValidationError, match="found 3 coefficients, not 4 or 5 or 8: brown"):
         Distortion(model="brown", coefficients=(0.1, 0.2, 0.3))
     with pytest.raises(ValidationError, match="only mei has it"):
         Distortion(model="fisheye", coefficients=(0.1, 0.2, 0.3, 0.0), xi=1.0)

@@ -132,7 +132,7 @@ def test_nothing_segmented_at_all_is_an_error(tmp_path: Path) -> None:
 
 def test_frames_of_two_segmenters_do_not_mix(tmp_path: Path) -> None:
     write_cache(IMAGES[:1], Dice(), URBAN, tmp_path, "python:dice:six")
-    with pytest.raises(ConfigError, match=r"started with .*dice:six.* called with .*dice:seven"):
+    with pytest.raises(ConfigError, match=r"started with .*dice:six.* now .*dice:seven"):
         write_cache(IMAGES, Dice(), URBAN, tmp_path, "python:dice:seven")
 
 

@@ -204,7 +204,7 @@ def test_a_folder_that_is_not_there_is_not_taken_for_a_model_of_the_hub(path: st
 
 def test_a_network_that_does_not_segment_is_refused(tmp_path: Path) -> None:
     transformers.ViTConfig(hidden_size=8, num_hidden_layers=1).save_pretrained(tmp_path)
-    with pytest.raises(DataError, match="a vit is no segmentation network"):
+    with pytest.raises(DataError, match="vit is no segmentation network"):
         open_segmenter(f"hf:{tmp_path}", URBAN)
 
 

@@ -289,7 +289,7 @@ def test_several_names_without_a_known_one_are_refused(tmp_path: Path) -> None:
         (
             np.full((24, 40), 120, np.uint8),
             "",
-            r"ids \[120\], which are no train_id of cityscapes; .*\?taxonomy=",
+            r"ids \[120\], which are no train_id of cityscapes .*\?taxonomy=",
         ),
         (rgb("cityscapes"), "?taxonomy=ade20k", r"found \['#\w+', .*|found colours, expected train_id ids"),
         (rgb("cityscapes"), "?ids=train_id", "found colours, expected train_id ids, not colours"),

@@ -290,9 +290,9 @@ def test_a_damaged_or_missing_file_is_named(tmp_path: Path, content: bytes | Non
     [
         ("mean=1,2", "three numbers"),
         ("std=a,b,c", "three numbers"),
-        ("std=1,0,1", "positive"),
-        ("order=grb", "order grb"),
-        ("pixel_max=2", "pixel_max 2"),
+        ("std=1,0,1", "above 0"),
+        ("order=grb", "order='grb'"),
+        ("pixel_max=2", "pixel_max='2'"),
         ("classes=cityscapes", "found 6 classes"),
         ("size=4", r"unknown options \['size'\]"),
     ],

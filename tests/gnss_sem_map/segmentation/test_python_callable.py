@@ -84,7 +84,7 @@ def test_what_is_no_probabilities_is_refused_with_the_image(module: str, name: s
         ("{}:number", "found int, expected a callable"),
         ("{}", "expected python:package.module:callable"),
         ("no_such_module_anywhere:f", "PYTHONPATH"),
-        ("{}:by_colour?classes=road,vegetation", "found 3 classes for 2"),
+        ("{}:by_colour?classes=road,vegetation", "found 3 classes, and 2"),
         ("{}:by_colour?classes=road,vegetation,skye", "did you mean 'sky'"),
     ],
 )

@@ -27,6 +27,17 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 MADE_FROM, ABOUT = "made_from", "about"
+DAMAGED = (
+    DataError,
+    LookupError,
+    TypeError,
+    ValueError,
+    OSError,
+    EOFError,
+    MemoryError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,5 +86,5 @@ def recall(path: Path, made_from: str | None) -> Found | None:
                 return None
             arrays = {name: archive[name] for name in archive.files if name not in (MADE_FROM, ABOUT)}
             return Found(json.loads(archive[ABOUT].tobytes()), arrays)
-    except (DataError, KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
+    except DAMAGED:
         return None

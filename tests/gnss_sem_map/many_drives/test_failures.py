@@ -88,7 +88,7 @@ def test_a_drive_that_kills_its_workers_is_left_out(
     made = run_drives(places, tmp_path / "out", SETTINGS, how, workers=2)
     assert made.about["merged"] == ["a", "b"]
     assert list(made.failed) == ["c"]
-    assert made.failed["c"].startswith("given up after 3 attempts: 3 x a worker process died (SIGKILL")
+    assert "given up after 3 attempts: 3 x a worker process died (SIGKILL" in made.failed["c"]
 
 
 @pytest.mark.slow

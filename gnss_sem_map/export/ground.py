@@ -77,10 +77,8 @@ def ground_of(exported: Exported, low: tuple[int, int], shape: tuple[int, int]) 
     surfaces = np.where(np.isnan(surfaces), voxels.centres[:, 2], surfaces)
     is_ghost, over, is_ground = _told_apart(exported, standing, surfaces)
     x, y = (voxels.indices[:, :2] - first).astype(np.int64).T
-    inside, (m, n) = (
-        (x >= 0) & (x < end[0] - first[0]) & (y >= 0) & (y < end[1] - first[1]),
-        (end - first).tolist(),
-    )
+    m, n = (end - first).tolist()
+    inside = (x >= 0) & (x < m) & (y >= 0) & (y < n)
     chosen = np.flatnonzero(inside & is_ground)
     columns, hits = x[chosen] * n + y[chosen], voxels.hits[chosen]
     points = np.bincount(columns, hits, m * n).reshape(m, n).astype(np.float32)

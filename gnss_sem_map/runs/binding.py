@@ -72,10 +72,8 @@ class LocatedJob:
         if "condensed" not in found.arrays or self.matches is None:
             return None
         drive, first = matched_along(*self.job.key, self.matches)
-        track, condensed = (
-            Trajectory(**found.of("track")),
-            CondensedDrive.from_bytes(found.arrays["condensed"].tobytes()),
-        )
+        track = Trajectory(**found.of("track"))
+        condensed = CondensedDrive.from_bytes(found.arrays["condensed"].tobytes())
         sweeps = sweeps_along(drive.log, first, self.job.saved)
         if is_own:
             return LocatedDrive(drive.log.name, sweeps, track, condensed)

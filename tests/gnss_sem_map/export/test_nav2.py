@@ -47,7 +47,7 @@ def cells_of(part: Part, grid: tuple[np.ndarray, float, np.ndarray]) -> np.ndarr
 
 
 def written(e: Exported, folder: Path, **robot: float) -> tuple[np.ndarray, float, np.ndarray]:
-    write_nav2(replace(e, nav2=Nav2Settings(**robot)), folder)  # type: ignore[arg-type]
+    write_nav2(replace(e, nav2=Nav2Settings.model_validate(robot)), folder)
     return map_server(folder / "map.yaml")
 
 
@@ -126,7 +126,7 @@ def test_windows_join_without_a_seam(tmp_path: Path, monkeypatch: pytest.MonkeyP
 )  # fmt: skip
 def test_a_robot_that_makes_no_sense_is_refused(robot: dict[str, float], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
-        Nav2Settings(**robot)  # type: ignore[arg-type]
+        Nav2Settings.model_validate(robot)
 
 
 def test_cells_that_do_not_fit_the_voxels_and_a_map_without_ground_are_refused(tmp_path: Path) -> None:
